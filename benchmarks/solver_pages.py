@@ -31,8 +31,8 @@ HEAD = """# Solvers
 A solver estimates the motion of the rig, rotation vector w and translation d over one frame period, from
 matches. `rsbench list solvers` names those of this page; `--solver NAME` of `solve`, `correct`, `evaluate`
 and `simulate` takes one. [One page has a section for each](../reference/solver-sheets.md), with its paper,
-equations, needs and assumptions. [Add a solver](../how-to/add-a-solver.md) says how they are written, and
-[Motion from one camera](monocular.md) is about those of one camera.
+equations, needs and assumptions. See also [Add a solver](../how-to/add-a-solver.md) and
+[Motion from one camera](monocular.md).
 
 ## Which one to take
 
@@ -44,16 +44,16 @@ The table comes from `python benchmarks/solver_pages.py`, from
 [measurements]({repository}/results/solvers/solvers.csv) by `python benchmarks/solver_measurements.py` on
 {date}, on one core of a busy {cores}-core machine ({processor}). The rig has two cameras of 900 x 900 px,
 f = 810 px, baseline 0.6 m and readout ratio 0.8. It moves by 2 deg and 0.3 m per frame period in random
-directions; points are 2 to 10 m away. A share of 10 of 10 trials means above {ten:.2f} with 95 %, 20 of 20
-above {twenty:.2f}.
+directions; points are 2 to 10 m away. The 95 % interval of a share of 1.00 begins at {ten:.2f} with 10 trials
+and at {twenty:.2f} with 20.
 
 - **Bias**: median error on 100 exact matches per camera that follow the motion model of the solver. Its order,
   in the sections, is the factor by which half the motion reduces it: about 2 is first order, 4 second. A solver
   that assumes a global shutter sees rolling-shutter matches here.
 - **Noise**: root mean square error with {noise} px of noise over the Cramer-Rao bound of what the solver is
-  given; 1 is best. A bias counts too, and one failure, which errs by 180 deg, is most of a root mean square.
-  The bound has six unknowns: velocities or an acceleration that a solver leaves free increase its factor.
-  Gyroscope and gravity are exact here, and known to the bound; affine frames are exact, and unknown to it.
+  given; 1 is best. The error includes the bias, and one failure, which counts as 180 deg, dominates it. The
+  bound has six unknowns: velocities or an acceleration that a solver leaves free increase its factor. Gyroscope,
+  gravity and affine frames are exact here; the bound includes the first two, but not the frames.
 - **Success**: share of robust estimates within {e_R} deg and {e_T} deg, at 0, 30 and 50 % outliers and at most
   1000 samples; then at 50 % with at most {few} samples, and with as many as take about {ms:.0f} ms. "Alone"
   means that the solver has a robust loop of its own, to which numbers of samples do not apply.
@@ -76,9 +76,9 @@ measurements that [Solvers](../explanation/solvers.md#what-is-measured) explains
 - **Success**: at 0, 30 and 50 % outliers; then at 50 % in equal time and with equal numbers of samples.
 - **Degenerate**: which of the 11 motions and scenes of
   [the suite]({repository}/cards/sweeps/degenerate.toml) are not always solved, without noise and with 0.3 px,
-  as numbers of solved trials: within {solved_R} deg and {solved_T} deg, or three times the bound where that is
-  more. A direction that the matches do not determine cannot be wrong. The rest are wrong answers, but for those
-  that the solver itself called failures.
+  as numbers of solved trials. A trial is solved if its errors are below {solved_R} deg and {solved_T} deg, or
+  three times the bound if that is more; a direction that the matches do not determine is ignored. The other trials
+  give a wrong motion or, if so stated, a failure.
 
 """
 USES = (
@@ -197,7 +197,7 @@ def measured(row: Mapping[Any, Any]) -> list[str]:
     """Lines from a row of the table of numbers."""
     shares = ", ".join(_share(row[f"success_{each}"]) for each in OUTLIERS)
     return [
-        f"- Measured with {row['information']}, {row['trials']} trials; samples are {row['sample']}.",
+        f"- Measured with {row['information']}, {row['trials']} trials; sample: {row['sample']}.",
         f"- Bias {_angle(row['bias_e_R_deg'])}, {_angle(row['bias_e_T_deg'])} (e_R, e_T){_order(row)}.",
         f"- Noise: e_R {_factor(row, 'e_R')}, e_T {_factor(row, 'e_T')}{_failures(row)}.",
         f"- Time: {_sample(row['sample_ms'])}, {_number(row['robust_ms_30%'])} ms robust.",

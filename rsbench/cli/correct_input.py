@@ -1,6 +1,6 @@
 """The input of ``rsbench correct``: frames of a rig, its card, a gyroscope's log and the target row.
 
-What a function alone needs is imported there, so that a wrong command line is refused at once.
+Functions import what only they need, so that a wrong command line is refused at once.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _MOST = 1e9
 _SAME_RATE = 0.01
-"""Relative difference of frame rates, up to which they are one, as 29.97 and 30."""
+"""Relative difference of frame rates that are taken as equal, such as 29.97 and 30."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +41,10 @@ class GyroscopeOptions:
             raise RsbenchError("--gyro-offset: needs --gyro, a gyroscope's log")
 
     def read(self, source: FrameSource, one_camera: bool) -> Gyroscope | None:
-        """The samples, and how far their clock may be off; None without a log.
+        """The samples, and the largest error of their clock; None without a log.
 
         Raises:
-            RsbenchError: a log that cannot be read, is of another time, or frames without a known rate.
+            RsbenchError: the log cannot be read or is of another time, or the frame rate is unknown.
         """
         if self.file is None:
             return None
@@ -67,7 +67,7 @@ class GyroscopeOptions:
         return Gyroscope(samples=samples, clock_error=FARTHEST_S * fps if unsure else 0.0)
 
     def _fps(self, source: FrameSource, rate: float | None) -> float:
-        """``--fps``, or the rate by the frames' own times; RsbenchError where there is none."""
+        """``--fps``, or the rate from the frames' times; RsbenchError if there is none."""
         fps = (rate or said_fps(source.path)) if self.fps is None else self.fps
         if fps is None:
             raise RsbenchError("--fps: is required with --gyro and images, which have no frame rate")
@@ -78,7 +78,7 @@ class GyroscopeOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadoutOptions:
-    """The options of a readout, in place of what the file of a rig or camera says."""
+    """The options of the readout, which replace values of the file of a rig or camera."""
 
     readout_ratio: float | None
     shutter: str | None
@@ -86,14 +86,14 @@ class ReadoutOptions:
 
     @property
     def any(self) -> bool:
-        """Whether the user gave one that is about the readout alone."""
+        """Whether the user gave one that concerns only the readout."""
         return self.readout_ratio is not None or self.shutter is not None
 
     def beside(self, path: Path | None, gyro: bool, footage: Path | None) -> Readout:
-        """What they say beside this file, with the rate of a video where seconds need one.
+        """The readout from these options and this file, with the rate of a video if seconds need one.
 
         Raises:
-            RsbenchError: options that exclude each other, or ``--fps`` that nothing needs.
+            RsbenchError: options that exclude each other, or an unnecessary ``--fps``.
         """
         from rsbench.interop.readers.rig_files import Readout
 
@@ -107,7 +107,7 @@ class ReadoutOptions:
 
 
 def size_of(frames: list[Path] | Path, part: Part = "whole") -> Callable[[], tuple[int, int]]:
-    """A function that gives the (width, height) of the first of some frames, a folder's or a video's."""
+    """A function that returns the (width, height) of the first frame, of a folder or a video."""
 
     def size() -> tuple[int, int]:
         height, width = next(iter(frame_source(frames, part))).shape[:2]
@@ -122,14 +122,14 @@ def frame_source(frames: list[Path] | Path, part: Part = "whole") -> FrameSource
 
 
 def say_notes(option: str, notes: tuple[str, ...]) -> None:
-    """What was assumed of a calibration, a line each, on stderr."""
+    """Print the assumptions about a calibration to stderr, a line each."""
     for note in notes:
         echo(f"rsbench: note: {option}: {note}", err=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arranged:
-    """What the files of a command line are: of one camera, or of a rig."""
+    """The files of a command line, of one camera or of a rig."""
 
     one_camera: bool
     frames: list[Path] | None
@@ -138,7 +138,7 @@ class Arranged:
     """Folder or video; of one camera its own."""
     right: Path | None
     words: str = ""
-    """What was assumed, and the option that says otherwise; empty where nothing was."""
+    """The assumption, and the option that changes it; empty if there is none."""
 
 
 def is_rendered(folder: Path) -> bool:
@@ -155,7 +155,7 @@ def arranged(
     right: Path | None,
     side_by_side: bool,
 ) -> Arranged:
-    """Whose frames are given: those of one camera, unless there is a rig.
+    """Sort the given files: frames of one camera, unless there is a rig.
 
     Raises:
         RsbenchError: files that do not exist or do not go together.
@@ -228,7 +228,7 @@ def _is_image(path: Path) -> bool:
 
 
 def _nearest(path: Path) -> str:
-    """The names beside a path that are like it, for a message."""
+    """Similar names in the folder of a path, for a message."""
     folder = path.parent
     names = sorted(each.name for each in folder.iterdir()) if folder.is_dir() else []
     near = difflib.get_close_matches(path.name, names, 3)
@@ -236,15 +236,15 @@ def _nearest(path: Path) -> str:
 
 
 def default_out(path: Path) -> Path:
-    """Where results go unless it is given: a video beside where the command runs, or a folder."""
+    """The default place of the results: a video in the current folder, or a folder."""
     return Path(f"{path.stem}-corrected.mp4" if path.is_file() else f"{path.resolve().name}-corrected")
 
 
 def check_out(out: Path) -> None:
-    """Refuse a place for results that cannot be one, before work begins.
+    """Refuse an impossible place for results before work begins.
 
     Raises:
-        RsbenchError: the ending of an image or of a video that is not written, or a file where a folder has to be.
+        RsbenchError: the name ends like an image or an unsupported video, or a file is in place of a folder.
     """
     video = written_as_video(out)
     if _is_image(out):
@@ -258,23 +258,23 @@ def check_out(out: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectInput:
-    """What is to be corrected, and where to."""
+    """The frames to correct, and the place of the results."""
 
     card: RigCard | OneCameraCard
     out: Path
     four: list[Path] = field(default_factory=list)
-    """Left 0, right 0, left 1, right 1; or, of footage, nothing."""
+    """Left 0, right 0, left 1, right 1; empty for footage."""
     footage: list[list[Path] | Path] = field(default_factory=list)
     """Images, or the folder or video, of the left and the right camera, or of one."""
     words: str = ""
-    """What was assumed of the files; empty where nothing was."""
+    """The assumption about the files; empty if there is none."""
     gyro: GyroscopeOptions
     side_by_side: bool = False
     """Whether both cameras are halves of the frames of one video or folder."""
     row_poses: bool = False
-    """Whether the pose at every row of a sequence is wanted."""
+    """Whether to write the pose at every row of a sequence."""
     rectify: bool = False
-    """Whether rectified pairs are wanted too."""
+    """Whether to write rectified pairs too."""
 
     @property
     def one_camera(self) -> bool:
@@ -288,7 +288,7 @@ class CorrectInput:
 
     @property
     def page(self) -> Path:
-        """Where the page will be."""
+        """Path of the page."""
         from rsbench.dataset.corrected_frames import page_of_video
 
         return page_of_video(self.out) if self.video else self.out / "report.html"
@@ -360,7 +360,7 @@ def given_frames(
         raise RsbenchError("--rig: is required")
     for option, wanted in (("--row-poses", row_poses), ("--gyro", gyro.file is not None)):
         if wanted and frames:
-            raise RsbenchError(f"{option}: two times have no trajectory; give --left and --right of four and more")
+            raise RsbenchError(f"{option}: two frames have no trajectory; give four or more by --left and --right")
     from rsbench.interop.readers.rig_files import read_rig_file
 
     stated = readout.beside(rig, gyro.file is not None, left)
@@ -405,7 +405,7 @@ def sequence_files(sequence: Sequence) -> list[list[Path] | Path]:
 
 
 def target_row(target: str, height: int) -> float:
-    """The row that ``--target`` names; RsbenchError where there is none."""
+    """The row that ``--target`` names; RsbenchError if there is none."""
     named = {"first": 0.0, "middle": (height - 1) / 2, "last": height - 1.0}
     if target in named:
         return named[target]

@@ -35,7 +35,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench reproduce leaderboard --out results --data data  [dim](our solvers on points: 25 minutes of a core)[/dim]
 
-  rsbench reproduce laws --out results --data data         [dim](five laws: renders 180 sequences first)[/dim]
+  rsbench reproduce laws --out results --data data         [dim](five motion models: 180 sequences)[/dim]
 
   rsbench reproduce boards --out results --data data       [dim](tracks of frames, 216 sequences: 3 hours)[/dim]
 
@@ -119,19 +119,19 @@ def reproduce(
             show_default=False,
             help="Without one, a list with minutes. "
             "images: the paper's image experiment in castle, old-town and room. fig3: its Figure 3 on "
-            "simulated points. claims: what became of each claim about them, in every reading of the paper's "
+            "simulated points. claims: a verdict on each claim about them, in every reading of the paper's "
             "solver. readings: the claims in settings that it does not state. image-claims: those about images, "
             "from stored results. sweeps: the other simulations. "
             "fig4: its Figure 4 in every scene, for three motions; fig4-literal, part of it: in its scene, by the "
             "paper's own solver, SIFT and a single view. correction: baselines, ours and oracles on "
-            "mild, moderate, aggressive and poles. laws-correction: the same under five laws of motion. "
-            "sgm: stereo matching when the cameras' rows are not in step. "
-            "real: the default pipeline on rendered frames with lens, blur and noise, beside an ideal camera's. "
+            "mild, moderate, aggressive and poles. laws-correction: the same under five motion models. "
+            "sgm: stereo matching when the cameras read a row at different times. "
+            "real: the default pipeline on rendered frames with lens, blur and noise, and with an ideal camera. "
             "leaderboard: our solvers on the public split of points, its site, and the scores of the smoke run. "
-            "laws: points and frames under several laws of motion, with the predictions of solvers. "
-            "boards: the same of the tracks of frames, on the dataset standard. "
-            "handheld: trajectories of whole sequences from hands. "
-            "footage: what one camera's correctors make of pairs of frames. "
+            "laws: points and frames under five motion models, with the predictions of solvers. "
+            "boards: the same for the tracks of frames, on the dataset standard. "
+            "handheld: trajectories of whole hand-held sequences. "
+            "footage: correctors of one camera on pairs of frames. "
             "recorded: our solvers on points under recorded motion. "
             "held-out: solvers, also of others, on the announced secret splits of points. "
             "everything: all of these, one after the other, with the time that each took.",

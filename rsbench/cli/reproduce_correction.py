@@ -112,7 +112,7 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
 
 
 def laws_correction(out: Path, data: Path, workers: int | None = None) -> None:
-    """The same methods where motions follow five laws, on the sequences of ``laws`` without a sensor's noise."""
+    """The same methods under five motion models, on the sequences of ``laws`` without sensor noise."""
     folder = out / "laws-correction"
     images, _, motions = _studied("laws", LAWS_FRAMES, data, workers, lambda name: "-ideal-" in name)
     write_table(folder / "sequences.csv", by_sequence(images))

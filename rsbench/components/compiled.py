@@ -1,13 +1,13 @@
 """Compiled functions: one decorator for the whole package, and the cache of their machine code.
 
-Compiling takes tens of seconds on a slow machine, so its result is kept on disk: in ``NUMBA_CACHE_DIR`` where the
+Compiling takes tens of seconds on a slow machine, so the code is cached on disk: in ``NUMBA_CACHE_DIR`` if the
 user set it, else in the user's cache folder, else in a temporary folder. Each version of the compiled sources has
-its own folder there, because Numba checks only the file of the function that it loads, not the files of functions
-which that one calls. Each signature of a function has its own file, so that processes which compile at the same
-time write the same files.
+its own folder there, because Numba checks only the file of the function that it loads, not those of the functions
+that it calls. Each signature of a function has its own file, so that processes that compile at the same time write
+the same files.
 
-A package may bring code in ``SHIPPED`` that was compiled for ``PORTABLE_CPU``. It is loaded where nothing else is
-kept, and only on a processor that has all that it uses, under the same Python, Numba and sources.
+A package may contain code in ``SHIPPED`` that was compiled for ``PORTABLE_CPU``. It is loaded if there is no
+other, and only on a processor with all its instructions, with the same Python, Numba and sources.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ _VERSION = re.compile(r"[0-9a-f]{16}")
 SHIPPED = "_compiled"
 """Folder of the package with portable code, as a cache folder; ``rsbench compile --portable`` writes it."""
 PORTABLE_CPU = "x86-64-v3"
-"""LLVM's name of the processor that portable code is for: most of x86 since 2013 to 2015."""
+"""LLVM's name of the processor of portable code: most x86 processors since 2013 to 2015."""
 _PORTABLE_NEEDS = (
     *("cx16", "popcnt", "sahf", "sse3", "ssse3", "sse4.1", "sse4.2"),
     *("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"),
 )
-"""LLVM's names of what that processor has beyond the first of its kind (x86-64 psABI, level 3)."""
+"""LLVM's names of the features of that processor beyond x86-64 (psABI, level 3)."""
 _MARKS = (b"@compiled", b"MotionKernel")
 """Marks of files with compiled code; the version is the hash of all such files."""
 
@@ -110,7 +110,7 @@ class _KernelCache(FunctionCache):
         return IndexDataCacheFile(str(folder), f"{self._impl.filename_base}-{signature}", source_version())
 
     def load_overload(self, sig: tuple[Any, ...], target_context: Any) -> Any:
-        """Without loading what Numba compiles with, which takes as long as a solve; compiling loads it itself."""
+        """Without loading Numba's compiler, which takes as long as a solve; compiling loads it."""
         rtsys.initialize(target_context)  # memory of arrays
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
@@ -125,7 +125,7 @@ class _KernelCache(FunctionCache):
                 found = None if file is None else file.load(wanted)
                 if found is not None:
                     return self._impl.rebuild(target_context, found)
-            except Exception:  # half a file, or one of another Numba: it is compiled again
+            except Exception:  # incomplete, or of another Numba: it is compiled again
                 continue
         _STOPWATCH.begin()
         return None
@@ -143,7 +143,7 @@ class _KernelCache(FunctionCache):
 
 
 class _Stopwatch:
-    """Warns in one line, once, when compiling takes long."""
+    """Warn in one line, once, if compiling takes long."""
 
     def __init__(self) -> None:
         self.depth, self.started, self.seconds, self.warned = 0, 0.0, 0.0, False
@@ -184,7 +184,7 @@ def _holds_compiled_code(file: str) -> bool:
 
 @functools.cache
 def cache_folder() -> Path | None:
-    """Folder of the compiled code of these sources, made if missing; None where nothing can be written."""
+    """Folder of the compiled code of these sources, made if missing; None if it cannot be written."""
     for base in (Path(config.CACHE_DIR) if config.CACHE_DIR else None, user_cache(), temporary()):
         if base is None:
             continue
@@ -203,13 +203,13 @@ def cache_folder() -> Path | None:
 
 @functools.cache
 def shipped_folder() -> Path | None:
-    """Folder of portable code of these sources; None where there is none, or this processor cannot run it."""
+    """Folder of portable code of these sources; None if there is none, or this processor cannot run it."""
     folder = Path(str(resources.files("rsbench"))) / SHIPPED / "kernels" / source_version()[:16]
     return folder if folder.is_dir() and runs_portable_code() else None
 
 
 def runs_portable_code() -> bool:
-    """Whether this processor, as the system lets it be used, has all that portable code may use."""
+    """Whether this processor, under this system, has all features that portable code may use."""
     if platform.machine().lower() not in ("x86_64", "amd64"):
         return False
     features = binding.get_host_cpu_features()

@@ -1,8 +1,8 @@
-"""Other packages' code: classes by ``package.module:Class``, entry points, and the hash of the source behind them.
+"""Other packages' code: classes by ``package.module:Class``, entry points, and hashes of their sources.
 
-Code is imported from what is installed or lies beside a card, first in a child process, which it may end or block.
-What it raises becomes one line. Equal component keys mean equal answers, whatever file or name a component came
-from.
+Modules that are installed or beside a card are imported in a child process first, which they may end or block.
+Their exceptions become one line. Equal component keys mean equal answers, whatever the file or name of a
+component.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from typing import Any, NoReturn
 from rsbench.core.errors import RsbenchError
 
 _NUMERIC_ROOMS = ("core", "solvers", "vision", "capture", "pipeline")
-"""Packages whose source decides what a component of ours answers."""
+"""Packages whose source determines the answers of rsbench's components."""
 _NUMERIC_FILES = ("components/compiled.py", "components/motion_kernels.py", "components/motion_models.py")
-"""Modules outside these packages of which that is true too."""
+"""Further modules of this kind outside these packages."""
 
 
 def component_key(component: object, parameters: Mapping[str, Any]) -> str:
     """Hash of a component's class, source, parameters, and the keys of the components inside it.
 
     The parameters of a dataclass are all its fields, so that a changed default changes the key; those of another
-    class are the ones that its card gives.
+    class are the ones in its card.
     """
     cls = type(component)
     if dataclasses.is_dataclass(component) and not isinstance(component, type):
@@ -57,15 +57,15 @@ def component_key(component: object, parameters: Mapping[str, Any]) -> str:
 
 
 def _text(value: object) -> str:
-    """Text of a value that JSON cannot represent, without its address in memory, which differs in every run."""
+    """Text of a value that JSON cannot represent, without its memory address, which differs in every run."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
 
 
 def source_version(cls: type) -> str:
-    """Hash of the source that a class's answers come from.
+    """Hash of the source that determines a class's answers.
 
-    That is all of rsbench's numerics for its own classes, the whole package for another package's, and for a
-    single file that file and the files beside it that it imports.
+    For rsbench's classes this is all of its numerical code, for another package's the whole package, for a single
+    file this file and the files beside it that it imports.
     """
     module = cls.__module__
     if module.partition(".")[0] == "rsbench":
@@ -115,7 +115,7 @@ def _imported(file: Path) -> set[str]:
 
 @functools.cache
 def own_source_version() -> str:
-    """Hash of rsbench's own sources that decide what solvers, matchers and correctors answer."""
+    """Hash of rsbench's sources that determine the answers of solvers, matchers and correctors."""
     package = Path(str(resources.files("rsbench")))
     rooms = [path for room in _NUMERIC_ROOMS for path in (package / room).rglob("*.py")]
     return hash_of_files(package, sorted([*rooms, *(package / name for name in _NUMERIC_FILES)]))
@@ -127,12 +127,12 @@ def hash_of_files(folder: Path, files: list[Path]) -> str:
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file's bytes. This module is imported by children that try packages, so it needs no NumPy."""
+    """SHA-256 of a file's bytes. Children that test imports load this module, so it does not import NumPy."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def entry_points_by_name(group: str) -> dict[str, list[metadata.EntryPoint]]:
-    """Entry points of a group; several of one name where they differ. Loads nothing."""
+    """Entry points of a group; different ones may have one name. Loads nothing."""
     found: dict[str, list[metadata.EntryPoint]] = {}
     for point in points_of(group, tuple((folder, _changed(folder)) for folder in sys.path)):
         same = found.setdefault(point.name, [])
@@ -154,7 +154,7 @@ def package_of(point: metadata.EntryPoint) -> str:
 def points_of(group: str, folders: tuple[tuple[str, int], ...]) -> Sequence[metadata.EntryPoint]:
     """Entry points of a group, cached while ``folders`` (of ``sys.path``, with times of change) are equal.
 
-    A package whose metadata cannot be read has none, and does not affect others.
+    A package whose metadata cannot be read has none.
     """
     try:
         return tuple(metadata.entry_points(group=group))
@@ -177,7 +177,7 @@ def _changed(folder: str) -> int:
 
 
 IMPORT_LIMIT = "RSBENCH_IMPORT_LIMIT_S"
-"""Environment variable: seconds within which another package's module must be imported."""
+"""Environment variable: time limit for the import of another package's module, seconds."""
 _LIMIT_S = 60.0
 _POSIX = os.name == "posix"
 _IMPORTED = 173
@@ -189,7 +189,7 @@ _COMMAND = (
 )
 _expendable = False
 _beside_cards: dict[str, tuple[Path, str]] = {}
-"""Modules that were imported from beside a card: file, and its hash when it was imported."""
+"""Modules imported from the folders of cards: file, and its hash at that time."""
 _threads: list[threading.Thread] = []
 """Threads that other packages' code started."""
 _folders: list[str] = []
@@ -210,14 +210,14 @@ _RENAMED = {
     "rsbench.solvers.twelve_parameters": "rsbench.solvers.free_velocities",
     "rsbench.solvers.upright": "rsbench.solvers.gyro_and_gravity",
 }
-"""Modules that users' cards may name and whose classes have moved: the module of each now."""
+"""Present modules of classes that users' cards may name by a former module."""
 
 
 @contextlib.contextmanager
 def blaming(where: str, what: str) -> Iterator[None]:
-    """Turn what other packages' code raises into one line with its name; what it prints goes to stderr.
+    """Turn exceptions of other packages' code into one line with its name; its output goes to stderr.
 
-    Threads that it starts do not keep the command from ending, see ``abandoned_threads``.
+    Its threads do not keep the command from ending, see ``abandoned_threads``.
     """
     before = set(threading.enumerate())
     try:
@@ -240,10 +240,10 @@ def exception_text(error: BaseException) -> str:
 
 
 def import_file(file: Path) -> ModuleType:
-    """The module of a Python file, which other modules beside it may be part of.
+    """The module of a Python file, which may import others beside it.
 
     Raises:
-        RsbenchError: no such file, a name that no module can have, or whatever importing it raises: one line.
+        RsbenchError: no such file, not a name of a module, or an exception of the import: one line.
     """
     if not file.is_file():
         raise RsbenchError(f"{file}: no such file")
@@ -254,7 +254,7 @@ def import_file(file: Path) -> ModuleType:
 
 
 def import_target(target: str, folder: Path | None, where: str) -> object:
-    """The object that ``package.module:Class`` names, from what is installed or from modules in a folder."""
+    """The object ``package.module:Class`` of an installed module or of one in a folder."""
     module, _, name = target.partition(":")
     module = _RENAMED.get(module, module)
     if not all(part.isidentifier() for part in [*module.split("."), name]):
@@ -267,15 +267,15 @@ def import_target(target: str, folder: Path | None, where: str) -> object:
 
 
 def abandoned_threads() -> bool:
-    """Whether threads of other packages' code are alive for which Python would wait at exit."""
+    """Whether threads of other packages' code are alive, for which Python would wait at exit."""
     return any(thread.is_alive() for thread in _threads)
 
 
 def try_import(module: str, version: str = "") -> None:
     """Import another package's module in a child process first, so that it cannot end or block this one.
 
-    An exception there is ignored: the import here raises it again. Each version of a module is tried once; modules
-    of rsbench and modules that are imported already are not tried.
+    An exception there is ignored: the import here raises it again. Each version of a module is tested once;
+    modules of rsbench and imported ones are not tested.
 
     Raises:
         ImportError: the child ended or took too long.
@@ -365,8 +365,8 @@ def lifeline() -> Iterator[int]:
 def end_with(line: int) -> None:
     """In a child that leads its process group: let Linux kill the group when the parent is gone.
 
-    However the parent ended, its end of the pipe is closed; this works even while code that holds Python's lock
-    loops.
+    However the parent ends, its end of the pipe is closed; this works even while code loops that holds Python's
+    lock.
     """
     if sys.platform == "linux":
         import fcntl
@@ -381,7 +381,7 @@ def end_with(line: int) -> None:
 
 
 def import_untried() -> None:
-    """Import without trying in a child first: this process is one that other packages' code may end."""
+    """Import without a test in a child: other packages' code may end this process."""
     global _expendable
     _expendable = True
 
@@ -397,15 +397,15 @@ def ending(code: int) -> str:
 
 
 def search(card: Path) -> None:
-    """Let modules beside a card be imported, in child processes too."""
+    """Allow the import of modules beside a card, in child processes too."""
     _put_on_path(str(card.parent.resolve()))
 
 
 def _import_beside(module: str, folder: Path) -> ModuleType:
     """Import a module that is installed or lies in a folder.
 
-    The folder stays on the path, after everything that is installed, for later imports, in child processes too. A
-    module that has changed since it was imported is imported again.
+    The folder stays on the path, after installed packages, for later imports, in child processes too. A changed
+    module is imported again.
     """
     _put_on_path(str(folder))
     _forget_changed(folder)
@@ -438,7 +438,7 @@ def _put_on_path(folder: str) -> None:
 
 
 def _forget_changed(folder: Path) -> None:
-    """Forget the modules of a folder when the file of one of them has changed."""
+    """Remove the modules of a folder from Python's if the file of one of them has changed."""
     mine = {name: file for name, (file, _) in _beside_cards.items() if file.is_relative_to(folder)}
     if any(not file.is_file() or file_hash(file) != _beside_cards[name][1] for name, file in mine.items()):
         for name in mine:
@@ -447,7 +447,7 @@ def _forget_changed(folder: Path) -> None:
 
 
 def _refuse_other(name: str, beside: Path) -> None:
-    """Raise ImportError where a module beside a card has the name of a module from elsewhere."""
+    """Raise ImportError if a module beside a card has the name of another module."""
     if name in sys.modules:
         other = _file_of(name)
     else:
@@ -466,7 +466,7 @@ def _file_of(module: str) -> Path | None:
 def signals_later() -> Iterator[None]:
     """Delay the handlers of Ctrl-C and SIGTERM until after the block.
 
-    Native code may crash when they raise while it is imported, as Mitsuba sometimes did.
+    Native code, such as Mitsuba, may crash if a handler raises during its import.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # handlers run in the main thread alone

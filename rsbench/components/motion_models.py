@@ -153,7 +153,8 @@ def fixed_endpoint(name: str, parameters: Mapping[str, Any]) -> tuple[np.ndarray
 
 
 def _check_ends(motion: Motion, where: str) -> None:
-    """Another package's model must start at the body and reach (w, d) after a period: all scores rely on it."""
+    """Check that another package's model starts at the identity and reaches (w, d) after a period, as all scores
+    assume."""
     with blaming(where, "body_from_world fails"):
         R, t = motion.body_from_world(np.array([0.0, 1.0]))
         missed = [so3.angle(R @ np.stack([np.eye(3), so3.exp(motion.w).T])), t - np.stack([np.zeros(3), motion.d])]
@@ -210,7 +211,7 @@ class TwistMotion(Motion):
         return np.zeros(speed.shape), so3.cross(w, speed)
 
     def from_time(self, start: float) -> Motion:
-        return self  # a screw looks the same from everywhere on it
+        return self  # the twist of a screw motion is constant
 
     def fastest(self, first: float, last: float) -> tuple[float, float] | None:
         return float(np.linalg.norm(self.w)), float(np.linalg.norm(self.v))
@@ -219,7 +220,7 @@ class TwistMotion(Motion):
 @final
 @dataclass(frozen=True, eq=False, init=False)
 class InertialMotion(Motion):
-    """A body that nothing pushes: constant velocity in the world and constant rate of turn.
+    """A body without external forces: constant velocity in the world, constant angular velocity.
 
     The body's centre is at tau c in the world, c = -R(1)^T d, so
 
@@ -450,7 +451,7 @@ def twist_by_w(a: float, phi: Vector, v: Vector, T_w: FloatArray) -> None:
 
 @dataclass(frozen=True)
 class AnyLaw(MotionKernel):
-    """Any of the laws of motion of this package, by its number: one compiled function for all of them."""
+    """Any motion model of rsbench, by its number: one compiled function for all of them."""
 
     number: float
     acceleration: float = 0.0
@@ -546,7 +547,7 @@ def any_law(kernel: MotionKernel) -> MotionKernel:
 
 
 def quick_law(kernel: MotionKernel) -> MotionKernel:
-    """The kernel as solvers use it: that of the paper's law, which they assume by default, has code of its own."""
+    """The kernel as solvers use it; that of the paper's model, the default, has its own code."""
     return kernel if isinstance(kernel, LinearKernel) else any_law(kernel)
 
 
@@ -564,7 +565,7 @@ def load_kernel(motion_name: str, parameters: Mapping[str, Any] | None = None) -
         )
     motion, kernel = make_motion(motion_name, np.zeros(3), np.zeros(3), parameters), KERNELS[model]
     names = [field.name for field in dataclasses.fields(kernel)]  # pyrefly: ignore[bad-argument-type]
-    if issubclass(kernel, AnyLaw):  # its number, and an acceleration that the law lacks, are no parameters
+    if issubclass(kernel, AnyLaw):  # its number, and an acceleration that the model lacks, are no parameters
         names = [name for name in names if hasattr(motion, name)]
     return kernel(**{name: float(getattr(motion, name)) for name in names})
 

@@ -1,10 +1,10 @@
 """Components by name: cards that come with rsbench, a user's card, or an installed package's entry point.
 
-All kinds of components are found alike. A name is that of a card, of an entry point, or of a class of rsbench's
-own that needs no card; a value that ends in ``.toml`` is the path of a card, and ``FILE.py`` or ``FILE.py:NAME`` a
-class or marked function of that file, with its default parameters. A card has ``class = "package.module:Class"``,
-may have ``description``, ``parameters`` and the options of its kind. A name that two packages claim is an error
-only when that name is used; an exception of a package becomes one line with its name.
+All kinds of components are found in the same way. A name is that of a card, of an entry point, or of a class of
+rsbench that needs no card; a value that ends in ``.toml`` is the path of a card, and ``FILE.py`` or
+``FILE.py:NAME`` a class or decorated function of that file, with its default parameters. A card has ``class =
+"package.module:Class"``, may have ``description``, ``parameters`` and the options of its kind. A name that two
+packages claim is an error only when that name is used; an exception of a package becomes one line with its name.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ Options = TypeVar("Options")
 MARK = "rsbench_class"
 """Attribute of a function that is a component: the class that calls it."""
 CARD_OPTIONS = "card_options"
-"""Attribute of a class with its defaults for the further keys of a card, if it has any."""
+"""Attribute of a class with its defaults for further keys of a card, if any."""
 _PYTHON = re.compile(r"(.*\.py)(?::(.*))?", re.DOTALL)
 """A Python file, and the name of something in it."""
 
@@ -88,7 +88,7 @@ class Kind(Generic[Component, Options]):
     group: str = ""
     """Group of its entry points; by default ``rsbench.<folder of its cards>``."""
     base: type[Component]
-    """Contract: the class of which all components are subclasses."""
+    """Base class of all components."""
     options: type[Options]
     """Dataclass of the keys that a card may set beside the parameters; all have defaults."""
     built_in: Mapping[str, str] = field(default_factory=dict)
@@ -96,7 +96,7 @@ class Kind(Generic[Component, Options]):
     check: Callable[[Component], None] = _anything_goes
     """Raises ValueError for a component whose declarations are inconsistent."""
     mark: str = ""
-    """How a function becomes one, such as ``@rsbench.solver``; empty where only classes do."""
+    """The decorator of functions, such as ``@rsbench.solver``; empty if components must be classes."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "group", self.group or f"rsbench.{self.cards}")
@@ -119,7 +119,8 @@ class Entry(Generic[Component, Options]):
 
     @property
     def built_in(self) -> bool:
-        """Whether its class and those of the components inside are rsbench's own, to run in this process."""
+        """Whether its class and those of the components inside are rsbench's own, so that it runs in this
+        process."""
         part: object = self.component
         while part is not None:
             if type(part).__module__.partition(".")[0] != "rsbench":
@@ -186,12 +187,12 @@ def _without_card(
 
 
 def list_names(kind: Kind[Any, Any]) -> list[str]:
-    """Names of all components of a kind, sorted; two of one name are no error here."""
+    """Names of all components of a kind, sorted; equal names are no error here."""
     return sorted({offer.name for offer in offers(kind)})
 
 
 def offers(kind: Kind[Any, Any]) -> list[Offer]:
-    """All available names of a kind, sorted; two of one name clash when it is used. Loads nothing."""
+    """All available names of a kind, sorted; equal names are an error only when used. Loads nothing."""
     cards = list_cards(kind.cards) if kind.cards is not None else {}
     own = [Offer(name=name, origin="rsbench", path=path) for name, path in cards.items()]
     own += [Offer(name=name, origin="rsbench") for name in kind.built_in if name not in cards]
@@ -243,10 +244,10 @@ def load_class(kind: Kind[Component, Any], name: str, card: Path | None = None) 
 
 
 def description_of(kind: Kind[Any, Any], offer: Offer) -> str:
-    """The first paragraph of the docstring of an offer's class, for an offer without a card.
+    """First paragraph of the docstring of the class of a name without a card.
 
     Raises:
-        RsbenchError: another offer has its name, it cannot be loaded, or it is not of this kind.
+        RsbenchError: two components have this name, it cannot be loaded, or it is not of this kind.
     """
     _only_offer(kind, offer.name, "")
     return _first_paragraph(_offered_class(kind, offer)[0])
@@ -270,7 +271,7 @@ def _only_offer(kind: Kind[Any, Any], name: str, advice: str, where: str = "") -
 
 
 def _offered_class(kind: Kind[Component, Any], offer: Offer) -> tuple[type[Component], str]:
-    """The class of an offer without a card, and its name for messages."""
+    """The class of a name without a card, and its name for messages."""
     if offer.point is None:
         return _checked(kind, import_target(kind.built_in[offer.name], None, offer.name), offer.name), offer.name
     where = f"entry point {kind.group}:{offer.name} ({_owner(offer)})"
@@ -311,7 +312,7 @@ def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, O
 
 
 def _from_python(kind: Kind[Component, Options], text: str, file: str, name: str) -> Entry[Component, Options]:
-    """The only component of a Python file, or the one of that name; called like the file, or by that name."""
+    """The only component of a Python file, named like the file, or the one of that name."""
     module = import_file(Path(file))
     offered = {
         cls: key
@@ -333,7 +334,7 @@ def _from_python(kind: Kind[Component, Options], text: str, file: str, name: str
 
 
 def class_of(value: object) -> object:
-    """The class behind a marked function; anything else as it is."""
+    """The class of a decorated function; anything else is returned unchanged."""
     return getattr(value, MARK, value) if inspect.isfunction(value) else value
 
 
@@ -342,7 +343,7 @@ def _belongs(kind: Kind[Any, Any], cls: object) -> TypeGuard[type[Any]]:
 
 
 def _remedy(kind: Kind[Any, Any], module: object) -> str:
-    """What to write into a Python file that defines no component of a kind."""
+    """Remedy for a Python file that defines no component of a kind."""
     own = [each for each in vars(module).values() if inspect.isfunction(each)]
     own = [each for each in own if each.__module__ == getattr(module, "__name__", "")]
     likely = max(own, key=lambda each: len(inspect.signature(each).parameters) == 3, default=None)

@@ -1,4 +1,4 @@
-"""What solvers get: point correspondences of a stereo rig over two frames, and tracks made of them."""
+"""Point correspondences of a stereo rig over two frames, the input of solvers, and tracks made of them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from rsbench.core.so3 import FloatArray
 
 BoolArray = NDArray[np.bool_]
 JOIN_TOLERANCE_PX = 0.01
-"""Two ends are one point when neither coordinate differs by more: above the rounding of float32 and of printed
-numbers, below the noise of keypoints and the distance between two of them."""
+"""Two ends are one point if neither coordinate differs by more. It is above the rounding of float32 and of printed
+numbers, and below the noise of keypoints and the distance between two of them."""
 BEYOND_PX = float(np.nextafter(JOIN_TOLERANCE_PX, 1.0))
 _TRACK_HALF: dict[Side, list[int]] = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7]}
 SET_COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8, "lines": 16}
-"""The sets of matches, and how many numbers a match of each has: pixels, two and two."""
+"""Number of values per match in each set: pixel coordinates."""
 
 
 def _none(columns: int) -> FloatArray:
@@ -28,7 +28,7 @@ def _none(columns: int) -> FloatArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Correspondences:
-    """Matches in pixels of the images, distorted as they are, one row each; sets that do not exist are empty.
+    """Matches in pixels of the (distorted) images, one row each; absent sets are empty.
 
     The sets may hold the same points: ``tracks`` are seen in all four images, and their halves may be
     repeated in the pairwise sets, where ``JOIN_TOLERANCE_PX`` finds them. The order of matches has no meaning.
@@ -45,15 +45,15 @@ class Correspondences:
     tracks: FloatArray = field(default_factory=lambda: _none(8))
     """(n, 8) xl0, yl0, xr0, yr0, xl1, yl1, xr1, yr1: one point in all four images."""
     covariance: FloatArray = field(default_factory=lambda: _none(3))
-    """(n, 3) xx, xy, yy, px^2, of each row of ``tracks``: how well its ends agree with each other, as the images
-    predict it, up to a scale that all share. Empty where it is not known."""
+    """(n, 3) xx, xy, yy, px^2, of each row of ``tracks``: covariance of the alignment of its ends, as predicted
+    from the images, up to a common scale. Empty if unknown."""
     lines: FloatArray = field(default_factory=lambda: _none(16))
     """(n, 16) two ends xa, ya, xb, yb in left 0, right 0, left 1, right 1: one straight line in all four images.
-    The ends of one image are no points of another: the line alone is the same."""
+    Ends in different images need not be the same points."""
     affine: FloatArray = field(default_factory=lambda: _none(4))
-    """(n, 4) dx1/dx0, dx1/dy0, dy1/dx0, dy1/dy0: the affine frame of each row of ``left``, how the pixels around a
-    point of frame 0 lie in frame 1, to first order; of the images as they are, which a rolling shutter has
-    distorted. Empty where it is not known."""
+    """(n, 4) dx1/dx0, dx1/dy0, dy1/dx0, dy1/dy0: the affine frame of each row of ``left``, the map, to first
+    order, of the pixels around a point from frame 0 to frame 1 of the (rolling-shutter) images. Empty if
+    unknown."""
     gyro: FloatArray = field(default_factory=lambda: _none(4))
     """(n, 4) tau, w: samples of a gyroscope, dR/dtau = [w]x R, rad per period."""
 
@@ -93,7 +93,7 @@ SET_SIDES: dict[str, tuple[Side, ...]] = {
     "tracks": ("left", "right", "left", "right"),
     "lines": ("left", "left", "right", "right", "left", "left", "right", "right"),
 }
-"""The cameras whose pixels a match of each set has, one after the other."""
+"""The camera of each pixel of a match, in order, by set."""
 
 
 def without_lens(correspondences: Correspondences, rig: StereoRig) -> Correspondences:
@@ -138,7 +138,7 @@ def lens_covariance(
     """Covariances (n, 3) in pixels of the left image from those in ideal pixels; none of none.
 
     Args:
-        tracks: (n, 8) whose they are, in pixels of the images.
+        tracks: (n, 8) the tracks, in pixels of the images.
     """
     return _turned(covariance, inverse_2x2(camera.ideal_by_pixel(tracks[:, :2])))
 
@@ -184,7 +184,7 @@ def repeated(rows: FloatArray, others: FloatArray) -> BoolArray:
 def nearest_within(points: FloatArray, others: FloatArray, count: int = 1) -> tuple[FloatArray, NDArray[np.int64]]:
     """The nearest others (m, c) of points (n, c) in which no coordinate differs by more than the tolerance.
 
-    SciPy's trees do the same; loading them takes longer than a solve.
+    Loading SciPy's trees, which could do this, takes longer than a solve.
 
     Returns:
         Largest difference of a coordinate (n, count) in growing order, infinite where there is none; indices (n,
@@ -215,7 +215,7 @@ def nearest_within(points: FloatArray, others: FloatArray, count: int = 1) -> tu
 
 _STEREO_HALF = {"stereo_0": slice(0, 4), "stereo_1": slice(4, 8)}
 _RIVALS = 8
-"""Left-right matches that may end at one point, beyond which the farthest are not looked at."""
+"""Most left-right matches at one point that are considered, the nearest first."""
 _SAME_PX = 0.1 * JOIN_TOLERANCE_PX
 """Smallest difference that decides between rivals; smaller ones are rounding."""
 
@@ -241,9 +241,9 @@ def join_stereo(correspondences: Correspondences) -> Joined:
     """Make tracks of the matches over time that have a left-right match at both ends.
 
     Ends are one point when neither coordinate differs by more than ``JOIN_TOLERANCE_PX``. A match is part of at
-    most one track; of rivals the nearest join, whatever their order. The left matches' turn comes first, then that
-    of the right ones. A track has the ends of its match over time as they are, and the other camera's ends of
-    its left-right matches.
+    most one track; of several candidates the nearest are joined, whatever their order, first for left, then for
+    right matches. A track has the ends of its match over time, and the other camera's ends of its left-right
+    matches.
     """
     c = correspondences
     for side in SIDES:
@@ -310,6 +310,6 @@ def with_depth(tracks: FloatArray) -> FloatArray:
 
 
 def stereo_points(tracks: FloatArray, rig: StereoRig) -> FloatArray:
-    """Points (n, 3), metres, of tracks (n, 8) with depth, in the body as it is when frame 0 reads their row."""
+    """Points (n, 3), metres, of tracks (n, 8) with depth, in the body at the time of their row in frame 0."""
     depth = rig.depth(tracks[:, 0] - tracks[:, 2])
     return depth[:, None] * rig.camera.unproject(tracks[:, :2]) - rig.offset("left")

@@ -1,42 +1,41 @@
-"""What a stated deviation means, in one place: covariances for ellipsoids that hold the truth.
+"""Covariances whose 95 % ellipsoids contain the truth: what each stated deviation means.
 
 An estimate minimises a cost, the sum over measurements i of negative log-likelihoods with gradients g_i and
-curvatures H_i at the minimum. Four things make the inverse curvature too small a covariance, and each has one
-function here.
+curvatures H_i at the minimum. The inverse curvature is too small a covariance for five reasons.
 
 1. The model of the noise is approximate. The sandwich A^-1 (sum g_i g_i^T) A^-1 holds whatever the noise is (P.
    Huber, Proc. Fifth Berkeley Symposium, 1967; H. White, Econometrica 1980), with each g_i divided by the root of
-   1 - h_i for the part of its error that the fit has followed (HC2: J. MacKinnon, H. White, J. Econometrics 1985),
-   h_i = tr (H^-1 H_i) being the leverage of the measurement. From few measurements it is itself uncertain:
-   ``shrunk`` takes it towards a multiple of the inverse information, as far as its own scatter calls for (O.
-   Ledoit, M. Wolf, J. Multivariate Analysis 2004). Along each axis the larger one of it and of the inverse
-   information is stated (``larger``).
-2. Few measurements carry the information. With leverages that add up to p, as many equal measurements as K = p^2
-   / sum h_i^2 would have the same spread of information (L. Kish, Survey Sampling, 1965). A covariance from K
-   samples has squared errors as T^2 of H. Hotelling (Annals of Mathematical Statistics 1931), not as chi-squared;
-   ``small_sample_factor`` is the ratio of their quantiles. The ellipsoid of chi-squared then covers at that level.
-   Smaller ellipsoids (one deviation) cover slightly more than they name. A shrunk sandwich of which the share r
-   is left has the scatter of K / r^2 samples.
+   1 - h_i, because the fit reduces its residual (HC2: J. MacKinnon, H. White, J. Econometrics 1985), h_i = tr
+   (H^-1 H_i) being the leverage of the measurement. From few measurements it is itself uncertain: ``shrunk``
+   shrinks it towards a multiple of the inverse information, by an amount that depends on its scatter (O. Ledoit,
+   M. Wolf, J. Multivariate Analysis 2004). Along each axis the larger one of it and of the inverse information is
+   stated (``larger``).
+2. Few measurements carry the information. With leverages that add up to p, their effective number is K = p^2 / sum
+   h_i^2 (L. Kish, Survey Sampling, 1965). With a covariance from K samples, normalised squared errors follow the
+   T^2 distribution of H. Hotelling (Annals of Mathematical Statistics 1931), not chi-squared;
+   ``small_sample_factor`` is the ratio of their quantiles, so that the 95 % ellipsoid of chi-squared covers 95 %.
+   Smaller ellipsoids (one deviation) cover slightly more than their level. A sandwich that was shrunk by the
+   factor r has the scatter of K / r^2 samples.
 3. Neighbouring measurements have common errors. The sandwich over tiles of the image as clusters (K.-Y. Liang, S.
    Zeger, Biometrika 1986) has few degrees of freedom, so that it is summarised by one number: its mean variance
    over that of independent measurements, at least 1 (``shared_error_factor``). It multiplies covariances, and it
    divides log-likelihoods where hypotheses are compared (P. McCullagh, J. Nelder, Generalized Linear Models, 1989,
    9.2: quasi-likelihood; R. Royall, T.-S. Tsou, J. Royal Statistical Society B 2003).
-4. Errors do not average out. Places of image features have a bias of some hundredths of a pixel that depends on
-   their subpixel phase and on the texture (M. Shimizu, M. Okutomi, ICCV 2001), and that the matches of a region
-   share: a fit to many good matches follows it without a trace in the residuals. ``common_shifts`` adds what
-   shifts of ``SHIFT_PX`` of all matches in a tile, each view and axis by itself, do to the estimate.
-5. The hypothesis itself is uncertain. The covariance of a mixture adds the squared distances between what the
-   hypotheses give, weighted by their probabilities (``spread_about``; J. Hoeting, D. Madigan, A.
-   Raftery, C. Volinsky, Statistical Science 1999, eq. 3). A motion may also depart from all motion models;
-   ``capture.two_frame_spline.departure`` adds what shakes do that the matches need not show.
+4. Errors do not average out. Positions of image features have a bias of some hundredths of a pixel that depends on
+   their subpixel phase and on the texture (M. Shimizu, M. Okutomi, ICCV 2001). The matches of a region share it,
+   so a fit to many good matches follows it without visible residuals. ``common_shifts`` adds the effect of shifts
+   by ``SHIFT_PX`` of all matches in a tile, for each view and axis separately.
+5. The hypothesis itself is uncertain. The covariance of a mixture adds the squared distances between the estimates
+   under the hypotheses, weighted by their probabilities (``spread_about``; J. Hoeting, D. Madigan, A. Raftery, C.
+   Volinsky, Statistical Science 1999, eq. 3). A motion may also depart from all motion models;
+   ``capture.two_frame_spline.departure`` adds the effect of shakes that the matches may hide.
 
-A likelihood that is not Gaussian (a bound, two optima, a long tail) is not stated as one.
+A likelihood that is far from Gaussian (a bound, two optima, a long tail) is not represented.
 
 Each stated number is meant as one standard deviation of the error against the truth, and each covariance C is made
 for errors e with e^T C^-1 e below the 95 % quantile of chi-squared in 95 of 100 problems; how often that holds is
-measured in docs/explanation/deviations.md. It has no part for errors of
-what is given (calibration, shutter): where these are estimated, the caller adds what they contribute.
+measured in docs/explanation/deviations.md. Errors of given values (calibration, shutter) are not included; if
+these are estimated, the caller adds their effect.
 """
 
 from __future__ import annotations
@@ -51,21 +50,21 @@ from numpy.typing import ArrayLike, NDArray
 from rsbench.core.so3 import FloatArray
 
 LEVEL = 0.95
-"""Probability at which ellipsoids are made to cover."""
+"""Coverage of the ellipsoids."""
 TILES = (4, 3)
 """Columns of the image, and rows in each, in which measurements may have common errors."""
 FEWEST_PER_PARAMETER = 3.0
-"""K over p below which no covariance should be stated: wrong matches may outvote the right ones unseen."""
+"""K over p below which no covariance should be stated: most matches may be wrong without being detected."""
 SHIFT_PX, _SHIFT_SHARE = 0.006, 0.1
 """Standard deviation of the shift that the matches of a tile share in one view, pixels, and its largest share of
 the standard deviation of a match. The shift was chosen for the log score of the frames of the track pose-1, whose
 score does not depend on the share; that was chosen on 45 pairs of ``laws`` with seed 7."""
 _LEAST_FREEDOM = 3.0
-"""Of the denominator of F: fewer have quantiles that say nothing."""
+"""Least degrees of freedom of the denominator of F: with fewer its quantiles are extreme."""
 _MOST_FOLLOWED = 0.5
 """Largest leverage for which HC2 corrects."""
 _LEAST_LEFT = 1e-3
-"""Of a sandwich's own scatter: with less it has as many degrees of freedom as anyone needs."""
+"""Least factor r of a shrunk sandwich; below it the degrees of freedom are practically unlimited."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +98,8 @@ def stated_covariance(
         inverse: (p, p) A^-1, inverse of the cost's Hessian.
         information: (p, p) inverse of the expected information: covariance if the model of the noise holds.
         leverages: (n,) h_i.
-        places: (n, 2) where in the image each measurement is, in any unit.
-        parameters: that the measurements determine, p or fewer.
+        places: (n, 2) position of each measurement in the image, in any unit.
+        parameters: number of them that the measurements determine, p or fewer.
         shifts: (k, n, p) derivatives of g_i by k kinds of shift by a pixel; None: no point 4.
         sigma_px: standard deviation of a measurement.
     """
@@ -131,10 +130,11 @@ def common_shifts(shares: FloatArray, groups: NDArray[np.int64], sigma_px: float
 
 
 def shrunk(shares: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
-    """Covariance (p, p) of a sum of independent shares (n, p), and how much of their own scatter is left in it.
+    """Covariance (p, p) of a sum of independent shares (n, p), shrunk, and the factor r of their own scatter in
+    it.
 
-    Their second moments S, in units in which ``target`` is the identity, are taken towards a multiple of it: mu I
-    + r (S - mu I), mu = tr S / p. The share r that is left minimises the expected squared distance to the truth.
+    Their second moments S, in units in which ``target`` is the identity, are shrunk towards a multiple of it: mu I
+    + r (S - mu I), mu = tr S / p. The factor r minimises the expected squared distance to the truth.
     """
     size = np.sqrt(np.diagonal(target))
     half = size[:, None] * np.linalg.cholesky(target / np.outer(size, size))
@@ -158,7 +158,7 @@ def larger(covariance: FloatArray, other: FloatArray) -> FloatArray:
 
 
 def effective_count(leverages: FloatArray) -> float:
-    """K, as many equal measurements as have the leverages (n,); 0 for none."""
+    """K, the effective number of measurements with leverages (n,); 0 for none."""
     squares = float(np.sum(leverages**2))
     return float(np.sum(leverages)) ** 2 / squares if squares > 0.0 else 0.0
 
@@ -179,7 +179,7 @@ def variance_factor(freedom: float, parameters: int, level: float = LEVEL) -> fl
 
 
 def tiles(places: FloatArray, shape: tuple[int, int] = TILES) -> NDArray[np.int64]:
-    """Number (n,) of the tile of each place (n, 2); as many places in every column, and in every row of it."""
+    """Number (n,) of the tile of each place (n, 2); columns have equally many places, and so have their rows."""
     columns, rows = shape
     ranks = np.argsort(np.argsort(places[:, 0], kind="stable"), kind="stable")
     column = ranks * columns // max(len(places), 1)
@@ -215,12 +215,12 @@ def shared_error_factor(
 
 
 def tempered(probabilities: ArrayLike, factor: float) -> FloatArray:
-    """Probabilities of hypotheses (k,) whose log-odds count 1 / factor."""
+    """Probabilities of hypotheses (k,) after dividing their log-odds by ``factor``."""
     powers = np.asarray(probabilities, dtype=np.float64) ** (1.0 / factor)
     return np.asarray(powers / np.sum(powers))
 
 
 def spread_about(used: FloatArray, probabilities: ArrayLike, values: FloatArray) -> FloatArray:
-    """(p, p) mean square of the distance of hypotheses' values (k, p) from the value (p,) that is used."""
+    """(p, p) mean square of the distance of hypotheses' values (k, p) from the used value (p,)."""
     away = np.asarray(values) - used
     return np.asarray((np.asarray(probabilities)[:, None] * away).T @ away)

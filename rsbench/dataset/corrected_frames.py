@@ -1,4 +1,4 @@
-"""What ``rsbench correct`` stores: corrected frames or a video, masks, depth and the motion."""
+"""The files of ``rsbench correct``: corrected frames or a video, masks, depth and the motion."""
 
 from __future__ import annotations
 
@@ -56,24 +56,23 @@ MASK_VALUES = {
     Origin.GUESSED: 192,
     Origin.HERE: 255,
 }
-"""Grey value of each origin in the mask files: the larger, the better founded."""
+"""Grey value of each origin in the mask files, larger for more reliable origins."""
 MARKER = "motion.json"
 _HALF = "half"
-"""Name of the folder in the hidden one that a killed run is resumed from."""
+"""Name of the folder, in the hidden one, from which a killed run is resumed."""
 _ENTRIES = f"{HIDDEN}/frames"
 _LIST = f"{HIDDEN}/files.json"
-"""All that was written, below the folder."""
+"""Names of all written files below the folder."""
 
 
 @contextmanager
 def fresh_folder(out: Path, by: str = "rsbench correct", run: str = "") -> Iterator[Path]:
-    """A folder that takes the place and name of ``out`` when all is written; nothing is left after an error.
+    """A folder that replaces ``out`` when all is written; nothing is left after an error.
 
-    After a kill or an interruption of a ``run`` that has a key, the folder is what the next run of that key goes
-    on with.
+    After a kill or an interruption of a ``run`` that has a key, the next run of that key continues in the folder.
 
-    What the same command wrote there before is replaced: moved aside, and removed when the new is in its place.
-    A kill in between leaves it aside, and the next run puts it back.
+    Earlier results of the same command are replaced: they are moved aside, and removed when the new ones are in
+    place. If a kill comes in between, the next run moves them back.
 
     Args:
         out: see above.
@@ -81,8 +80,8 @@ def fresh_folder(out: Path, by: str = "rsbench correct", run: str = "") -> Itera
         run: key of all that decides what is written; without it nothing is resumed.
 
     Raises:
-        RsbenchError: ``out`` cannot be written, holds something that this command did not write, is the working
-            folder, or another command works there.
+        RsbenchError: ``out`` cannot be written, contains other files, is the working folder, or another command
+            works there.
     """
     place = out.resolve()
     if Path.cwd().is_relative_to(place):
@@ -113,7 +112,7 @@ def fresh_folder(out: Path, by: str = "rsbench correct", run: str = "") -> Itera
 
 
 def half_folder(hidden: Path, run: str) -> Path:
-    """The folder in a hidden one of what a run of this key has written so far; empty where it was another's."""
+    """The folder, in a hidden one, of the unfinished run of this key; emptied if it is of another key."""
     half = hidden / _HALF
     if not (half / "run").is_file() or (half / "run").read_text("utf-8") != run:
         remove(half)
@@ -123,7 +122,7 @@ def half_folder(hidden: Path, run: str) -> Path:
 
 
 def _refuse_others(out: Path, place: Path, by: str) -> None:
-    """What is to be replaced must be of this command, to the last file."""
+    """Check that all files to be replaced are of this command."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return
     written = read_json(place / _LIST) if (place / _LIST).is_file() else {"by": None}
@@ -149,11 +148,11 @@ def _exchange(fresh: Path, place: Path, old: Path) -> None:
 
 
 _PARTS = {"corrected": ".png", "mask": ".png", "depth": ".exr"}
-"""What is written of a frame, and as which files."""
+"""Which files of a frame are written."""
 
 
 def copy_frame(folder: Path, name: str, twin: str) -> None:
-    """What ``write_frame`` wrote of one frame as that of another."""
+    """Copy the files of one frame as those of another."""
     for part, suffix in _PARTS.items():
         if (written := folder / part / f"{twin}{suffix}").is_file():
             shutil.copyfile(written, folder / part / f"{name}{suffix}")
@@ -162,7 +161,7 @@ def copy_frame(folder: Path, name: str, twin: str) -> None:
 def write_frame(folder: Path, name: str, fused: Fused, *, whole: bool = True, orientation: int = UPRIGHT) -> None:
     """corrected/NAME.png, mask/NAME.png and, of a ``whole`` frame, depth/NAME.exr below ``folder``.
 
-    The ``orientation``, EXIF's number, goes into the first one; pixels stay as the sensor has them.
+    The ``orientation``, EXIF's number, is written to the first one; pixels are not rotated.
     """
     for part in _PARTS if whole else list(_PARTS)[:2]:
         (folder / part).mkdir(parents=True, exist_ok=True)
@@ -180,7 +179,7 @@ def read_corrected(folder: Path, name: str) -> NDArray[Any]:
 
 
 def read_fused(folder: Path, name: str) -> Fused:
-    """A frame that ``write_frame`` wrote; where it has no finite depth that is NaN."""
+    """A frame that ``write_frame`` wrote; NaN where it has no finite depth."""
     image, file = read_corrected(folder, name), folder / "depth" / f"{name}.exr"
     depth = read_depth(file) if file.is_file() else np.zeros(image.shape[:2], np.float32)
     return Fused(
@@ -213,7 +212,7 @@ def motion_record(found: FoundMotion | FoundOwnMotion) -> dict[str, Any]:
     if isinstance(found, FoundOwnMotion):
         return _own_motion_record(found)
     estimate, motion = found.robust.estimate, found.motion
-    # A covariance holds about the point that the solver solved for.
+    # The covariance is that of the solver's reference point.
     known = estimate.covariance is not None and found.reference_point == "body"
     gyro = {} if found.gyro is None else {"gyro": _gyro_record(found.gyro)}
     turned, shifted = found.unevenness
@@ -260,7 +259,7 @@ def _own_motion_record(found: FoundOwnMotion) -> dict[str, Any]:
 
 
 def _gyro_record(gyro: GyroFound) -> Any:
-    """What was found of it, or why it is not used."""
+    """The estimates of the gyroscope, or why it is not used."""
     if not gyro.used:
         return CONTRADICTED
     found = {"bias": gyro.bias, "shift": gyro.shift, "matrix": gyro.matrix, "noise": gyro.noise}
@@ -281,7 +280,7 @@ def rig_record(
     calibration: tuple[float, ...] = NO_ERRORS,
     rig_found: FoundRig | None = None,
 ) -> dict[str, Any]:
-    """What the correction assumed or found, and which components it was made with, ready for JSON."""
+    """Assumptions, estimates and components of the correction, for JSON."""
     best = None if capture is None else capture.likeliest
     components = {name: {"name": entry.name, "key": entry.key} for name, entry in options.components.items()}
     return {
@@ -305,7 +304,7 @@ def rig_record(
 
 
 def camera_alone_record(known: KnownCapture, options: CorrectionOptions, unit: str) -> dict[str, Any]:
-    """What the correction of one camera's frames assumed or found, ready for JSON; ``unit``: of length."""
+    """Assumptions and estimates of the correction of one camera's frames, for JSON; ``unit``: of length."""
     focal, best = known.focal, None if known.capture is None else known.capture.likeliest
     return {
         "units": {"length": unit, "angle": "rad", "time": "frame period", "depth": f"{unit}, 0 = unknown"},
@@ -332,13 +331,13 @@ def written_entries(folder: Path) -> list[dict[str, Any]]:
 
 
 def write_entry(folder: Path, entry: dict[str, Any]) -> None:
-    """What motion.json will say of a frame, after all that belongs to it: ``written_entries`` reads it back."""
+    """Write the entry of a frame in motion.json, after all its files: ``written_entries`` reads it back."""
     (folder / _ENTRIES).mkdir(parents=True, exist_ok=True)
     write_json(folder / _ENTRIES / f"{entry['number']:06d}.json", entry)
 
 
 def write_poses(folder: Path, name: str, number: int, taus: ArrayLike, poses: Pose) -> None:
-    """The part that a frame has in a file of poses, for ``join_poses``.
+    """Write the poses of one frame, for ``join_poses``.
 
     Args:
         taus: (n,) times of the poses, frame periods.
@@ -352,7 +351,8 @@ def write_poses(folder: Path, name: str, number: int, taus: ArrayLike, poses: Po
 
 
 def join_poses(folder: Path, name: str) -> None:
-    """NAME.csv in TUM's format, lines ``tau tx ty tz qx qy qz qw``, of the parts of all frames; no file of none.
+    """NAME.csv in TUM's format, lines ``tau tx ty tz qx qy qz qw``, from the parts of all frames; no file without
+    parts.
 
     Frame by frame, so that footage may be of any length.
     """
@@ -380,21 +380,21 @@ DEFAULT_FPS = 30.0
 
 
 def refuse_video(out: Path) -> None:
-    """Raise RsbenchError for a name that looks like a video where frames are no video."""
+    """Raise RsbenchError for the name of a video if the frames are not a video."""
     if written_as_video(out):
         raise RsbenchError(f"--out {out}: four images are no video; give a folder, or --left and --right")
 
 
 @contextmanager
 def video_place(out: Path, run: str = "") -> Iterator[Path]:
-    """A folder to work in for a video ``out``, from which ``write_video`` takes its frames; kept after a kill.
+    """A work folder for a video ``out``, with the frames for ``write_video``; kept after a kill.
 
     Args:
         out: the file.
         run: key of all that decides what is written, as of ``fresh_folder``; without it nothing is resumed.
 
     Raises:
-        RsbenchError: another file of that name, which this command did not write, or the place cannot be written.
+        RsbenchError: a file of that name exists that this command did not write, or the folder cannot be written.
     """
     place = out.resolve()
     with work_folder(place.parent, place.with_name(f".{place.name}{HIDDEN}")) as hidden:
@@ -409,7 +409,7 @@ def video_place(out: Path, run: str = "") -> Iterator[Path]:
 
 
 def _refuse_other_video(out: Path) -> None:
-    """What is to be replaced must be a video of this command, which its record lies beside."""
+    """Check that the file to be replaced is a video of this command, with its record."""
     record = record_of_video(out)
     ours = record.is_file() and read_json(record).get("video") == out.name
     if out.exists() and not (ours and out.is_file()):
@@ -424,12 +424,12 @@ def page_of_video(out: Path) -> Path:
 
 
 def comparison_of_video(out: Path) -> Path:
-    """The video beside a video that shows frames as they were read and as they are written."""
+    """The video beside a video with the frames before and after."""
     return out.with_name(f"{out.stem}-compare.mp4")
 
 
 def record_of_video(out: Path) -> Path:
-    """The file beside a video that says what ``motion.json`` says of frames."""
+    """The file beside a video with the content of ``motion.json``."""
     return out.with_suffix(".json")
 
 
@@ -447,11 +447,11 @@ def write_video(
 
     Args:
         out: the video.
-        half: a folder on the same disk, for what is not complete.
+        half: a folder on the same disk, for incomplete files.
         frames: all of one size.
         fps: frames per second of images.
         record: what was found, for JSON.
-        source: the frames read: what is written has their times, orientation, colours and sound.
+        source: the frames read, whose times, orientation, colours and sound the video gets.
         orientation: EXIF's number, in place of the source's.
         others: files that are ready in ``half`` and go beside the video, with the video's name in theirs.
 
@@ -474,5 +474,5 @@ def write_video(
 
 
 def fps_of(path: Path) -> float:
-    """Frames per second of a video file; a default for a folder or where the file does not say."""
+    """Frames per second of a video file; a default for a folder or if the file does not state it."""
     return said_fps(path) or DEFAULT_FPS

@@ -1,4 +1,4 @@
-"""Making a dataset from a card: sequence by sequence, each complete or absent, resumed where it stopped."""
+"""Make a dataset from a card, sequence by sequence. Each is complete or absent; an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ Build = Callable[[str], Built]
 
 
 class PosedScenes:
-    """The scene of the last sequence in the renderer: sequences that are seen from one place share it."""
+    """The renderer's scene of the last sequence, which sequences with the same viewpoint share."""
 
     def __init__(self, build: Build) -> None:
         self._build = build
@@ -91,12 +91,12 @@ class PosedScenes:
 
 
 def place_of(sequence: SequenceCard) -> tuple[object, ...]:
-    """What decides from where a sequence sees its scene."""
+    """Values that determine the viewpoint of a sequence."""
     return sequence.scene, sequence.viewpoint, sequence.start, sequence.moving
 
 
 def seen_scene(scene: Scene, sequence: SequenceCard) -> Scene:
-    """A scene in the frame of the body at time 0 of a sequence, with its objects that move."""
+    """A scene in the frame of the body at time 0 of a sequence, with its moving objects."""
     seen = scene.seen_from(scene.viewpoints[sequence.viewpoint], sequence.start)
     return with_moving(seen, sequence.moving) if sequence.moving else seen
 
@@ -132,13 +132,12 @@ def generate_dataset(
         workers: processes, or a cluster; each renders whole sequences.
         full_frames: make every rolling-shutter frame as the paper did, from one whole global-shutter image per
             row, and keep these images as gs_stack/<side>_<frame>/<row>.png.
-        rehash: read every file again, also those that have the size and times that they had when last read;
-            those of a store are downloaded.
+        rehash: read every file again, even with unchanged size and times; those of a store are downloaded.
         progress: see ``Progress``.
 
     Raises:
-        RsbenchError: ``out`` cannot be written, another command works there, or it holds a dataset of another
-            card or files of others in a sequence that is damaged; something that the card names does not exist.
+        RsbenchError: ``out`` cannot be written, another command works there, or it contains a dataset of another
+            card or other files in a damaged sequence; something that the card names does not exist.
         LostJobsError: see ``finished_jobs``.
     """
     options = load_card(RendererOptions, "renderers", card.renderer)
@@ -153,7 +152,7 @@ def generate_dataset(
             progress(name)  # pyrefly: ignore[not-callable]
 
     with open_destination(out, workers, rehash) as destination:
-        # Of this run alone, and the last one only: a scene takes hundreds of MB, and its card may change.
+        # Only in this run, and only the last one: a scene takes hundreds of MB, and its card may change.
         build = lru_cache(maxsize=1)(build_scene)
         scene_hashes = SceneHashes(destination.hidden / "scenes.json", lambda name: build(name).sha256)
         made: dict[str, Files] = {}
@@ -193,7 +192,7 @@ class _Run:
     def sequences(
         self, todo: list[SequenceCard], plans: dict[str, Plan], build: Build, workers: Workers
     ) -> Iterator[tuple[str, int]]:
-        """Names of sequences, with steps that were done; the last of a sequence is given when it is complete."""
+        """Names of sequences, with the steps done; the last step of a sequence is reported when it is complete."""
         if workers == 1 or not todo:
             stage = PosedScenes(build)
             for sequence in todo:
@@ -218,7 +217,7 @@ class _Run:
         if words := obstacle(mitsuba_scene, *card.geometry_of(sequence)):
             raise RsbenchError(f"sequence {sequence.name}: {words}; choose another motion, viewpoint or baseline")
         plan = with_gloss(plan, mitsuba_scene.glossy)
-        # Of this try alone: another machine may not know yet that its run was killed.
+        # A folder of this attempt only: another machine may not know yet that its run was killed.
         partial = self.target.work_folder() / f"{sequence.name}.{secrets.token_hex(4)}"
         for folder in {Path(name).parent for name in files_of(plan)}:
             (partial / folder).mkdir(parents=True, exist_ok=True)
@@ -274,7 +273,7 @@ def render_camera(
 ) -> Iterator[None]:
     """One camera at one time: the rolling-shutter frame, then the global-shutter frames at poses of its rows.
 
-    What a sensor does is done to the rolling-shutter frame alone; its clean twin is kept. Channels are written
+    The sensor is applied to the rolling-shutter frame only; the clean frame is kept too. Channels are written
     ``later``.
     """
     from rsbench.renderers.image import to_srgb8
@@ -319,7 +318,7 @@ def render_camera(
 def sequence_truth(
     folder: Path, card: DatasetCard, sequence: SequenceCard, scene: MitsubaScene, record: Mapping[str, Any]
 ) -> SequenceTruth:
-    """The truth of a rendered sequence, as its card gives it; ``record`` is that of the scene."""
+    """The truth of a rendered sequence, from its card; ``record`` is that of the scene."""
     from rsbench.renderers.visibility import SceneRays
 
     geometry = FixedGeometry(
@@ -375,7 +374,7 @@ _LISTED_BYTES = 200
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """Estimated cost of a dataset: that of left frames, times the number of pixels of all frames over theirs."""
+    """Estimated cost of a dataset: that of left frames, times the ratio of the pixels of all frames to theirs."""
 
     sequences: int
     files: int
@@ -385,7 +384,7 @@ class Estimate:
 
 
 def estimate_dataset(card: DatasetCard, progress: Callable[[str], None]) -> Estimate:
-    """Render a little of a card and count the rest; ``progress`` is called with the name of each scene tried.
+    """Estimate from a few rendered images; ``progress`` is called with the name of each scene tried.
 
     Raises:
         RsbenchError: a scene or renderer of the card does not exist.

@@ -1,15 +1,16 @@
-"""Other people's code in a child process, which may raise, exit, crash, hang or print without harm to the parent.
+"""Run other packages' code in a child process: it may raise, exit, crash, hang or print without harm to the
+parent.
 
-A worker starts its child with the first call and keeps it for the next ones. A call that takes longer than its
-limit, or whose child ends, is a failed ``Outcome`` with the reason; the child is killed with all processes of its
+A worker starts its child with the first call and keeps it for the next ones. A call that exceeds its time limit,
+or whose child ends, gives a failed ``Outcome`` with the reason; the child is killed with all processes of its
 group, and a fresh one serves the next call. What the child prints is captured. The child ends with its parent,
 even if the parent is killed. This protects against mistakes, not against malice: the code runs with the user's
-rights, and a process that leaves the group survives. Where memory is limited, the child's use is read ten times a
-second (a limit of the address space would not do: compilers and BLAS reserve far more of it than they use).
+rights, and a process that leaves the group survives. With a limit of memory, the child's use is read ten times a
+second (the address space cannot be limited instead: compilers and BLAS reserve far more of it than they use).
 
-A child sends only plain data, so that the parent executes nothing of it: None, a truth value, a
-number, a text, an array, or a tuple, list, dict or dataclass of these. A message is its length and an npz file:
-arrays, and the rest as JSON that refers to them.
+A child sends only plain data, none of which the parent executes: None, a truth value, a number, a text, an array,
+or a tuple, list, dict or dataclass of these. A message is its length and an npz file: arrays, and JSON that refers
+to them.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ START_LIMIT_S = 300.0
 NO_ANSWER = "gave no valid answer"
 _POLL_S = 0.1
 _LAST_ANSWER_S = 10.0
-"""Time to read the answer of a process that has ended; only one that left its group makes a call wait so long."""
+"""Time to read the answer of a process that has ended, seconds; reached only if a process left the group."""
 _KEPT_BYTES = 8192
 _LONGEST_REASON = 300
 _POSIX = os.name == "posix"
@@ -115,7 +116,7 @@ class IsolatedWorker:
             arguments: picklable.
             classes: the dataclasses that answers may hold.
             environment: variables that the child has besides those of this process.
-            cancel: once set, perhaps by another thread, calls end with ``Cancelled``.
+            cancel: after it is set, possibly by another thread, calls end with ``Cancelled``.
             memory_mb: limit of the child's memory; not applied where the system does not report its use.
         """
         self._memory_mb = memory_mb
@@ -123,12 +124,12 @@ class IsolatedWorker:
         self._classes = {cls.__name__: cls for cls in classes}
         self._environment = {**os.environ, **(environment or {})}
         self.cancel = cancel or threading.Event()
-        """See the argument; another event may take its place between calls."""
+        """See the argument; it may be replaced between calls."""
         self._child: _Child | None = None
         self._one_call = threading.Lock()
 
     def call(self, *arguments: object, limit_s: float) -> Outcome:
-        """The child's answer, or why there is none.
+        """The child's answer, or the reason of a failure.
 
         Raises:
             RuntimeError: rsbench's own code in the child is at fault.
@@ -219,7 +220,7 @@ class _Child:
     def exchange(
         self, request: bytes, limit_s: float, cancel: threading.Event, memory_mb: float | None
     ) -> tuple[bytes | None, str]:
-        """The answer to a request, or None and why there is none."""
+        """The answer to a request, or None and the reason."""
         # A child that does not read must not block its parent.
         threading.Thread(target=self._send, args=(request,), daemon=True).start()
         end = time.monotonic() + limit_s
@@ -265,7 +266,7 @@ class _Child:
                 self._process.stdin.close()
 
     def _ending(self) -> str:
-        """How the process ended, after waiting for a second at most."""
+        """How the process ended; waits for at most a second."""
         try:
             code = self._process.wait(1.0)
         except subprocess.TimeoutExpired:

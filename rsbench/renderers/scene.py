@@ -1,8 +1,8 @@
-"""A scene as Mitsuba holds it: built once, rendered from any number of poses.
+"""A scene in Mitsuba: built once, rendered from any number of poses.
 
-The textures of all materials lie as bytes in one array, looked up by one piece of code for ``sunsky``. Mitsuba
-keeps a texture as four floats a pixel, four times as much, and has code for each material. The arithmetic here is
-that of Dr.Jit's bilinear, repeated textures, bit for bit.
+For ``sunsky`` the textures of all materials are bytes of one array, with one look-up. Mitsuba stores a texture as
+four floats per pixel, four times as much, and compiles code for each material. The arithmetic is that of Dr.Jit's
+bilinear, repeated textures, bit for bit.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class Reflectances:
         """``surfaces``: Mitsuba's shapes, and their materials.
 
         Raises:
-            RsbenchError: a texture is none.
+            RsbenchError: a texture is invalid.
         """
         materials = {id(material): material for _, material in surfaces}
         textures = {key: checked_texture(each) for key, each in materials.items() if each.texture is not None}
         begins = dict(zip(textures, np.cumsum([0, *(t[..., 0].size for t in textures.values())]), strict=False))
-        # Dr.Jit turns a table of one entry into other code, hence two more.
+        # Dr.Jit compiles a table of one entry to different code, hence two more entries.
         texels = np.zeros(sum(t[..., 0].size for t in textures.values()) + 2, dtype=np.uint32)
         for key, texture in textures.items():
             of = texels[begins[key] : begins[key] + texture[..., 0].size].reshape(texture.shape[:2])
@@ -87,7 +87,7 @@ def _number(shape: Any) -> int:
 
 
 def _between(coordinate: Any, size: Any) -> list[tuple[Any, Any]]:
-    """The two texels of an axis about coordinates, each with its share; the last one's neighbour is the first."""
+    """The two texels of an axis around coordinates, with their weights; the last one's neighbour is the first."""
     place = dr.fma(coordinate, mi.Float(size), -0.5)
     whole, count = dr.floor(place), mi.Int32(dr.maximum(size, 1))
     share, at = place - whole, mi.Int32(whole)
@@ -123,7 +123,7 @@ def linear_codes() -> NDArray[np.float32]:
 
 
 COAT_INDEX = 1.5
-"""Refractive index of the clear coat of glossy surfaces: glass, lacquer, and what glTF means."""
+"""Refractive index of the clear coat of glossy surfaces: that of glass, lacquer and glTF."""
 _SLACK = 1e-3
 _SKY_ROWS = 64  # of the sky map that `path` samples; the sky is linear in the sine of the elevation
 
@@ -135,8 +135,8 @@ class MitsubaScene:
 
     Raises:
         RsbenchError: a mesh or texture has the wrong shape, is not finite or points at vertices that it does not
-            have; a textured mesh has no uv; the sun or the zenith has no direction; objects that move on a GPU; no
-            backend.
+            have; a textured mesh has no uv; the sun or the zenith has no direction; objects move on a GPU; there
+            is no backend.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -145,7 +145,7 @@ class MitsubaScene:
         self.light = scene.light
         drawn = [mesh for mesh in scene.meshes if mesh.faces.size]
         if variant == VARIANTS["cuda"] and any(mesh.mover for mesh in drawn):
-            # Each is a scene of its own; on a GPU the rays of a kernel meet one of them alone, without a word.
+            # Each is a scene of its own; on a GPU a kernel silently traces rays in only one of them.
             raise RsbenchError(
                 f"scene {scene.name}: objects that move are not rendered on a GPU: choose backend llvm"
             )
@@ -177,7 +177,7 @@ class MitsubaScene:
         """Scenes of the objects that move, each in the world as it is at time 0."""
         self.balls = [_ball([m.vertices for m in drawn if m.mover == k + 1]) for k in range(len(moved))]
         self.sky = Sky(scene.light, self.scene.environment())
-        gc.collect()  # `mi.traverse` leaves cyclic garbage that holds its shape, and so the textures
+        gc.collect()  # `mi.traverse` leaves cyclic garbage that references its shape, and so the textures
 
     def reflectance(self, hit: Any, active: Any) -> Any:
         """Diffuse reflectance (RGB) where Mitsuba's interactions are."""
@@ -198,14 +198,14 @@ class MitsubaScene:
         return self.scene
 
     def __del__(self) -> None:
-        # Dr.Jit keeps freed memory for arrays of the same size, which another scene hardly has: hundreds of MB.
+        # Dr.Jit keeps hundreds of MB of freed memory for arrays of the same size, which another scene hardly has.
         if self.__dict__ and not sys.is_finalizing():
             self.__dict__.clear()
             give_back_memory()
 
 
 def give_back_memory() -> None:
-    """Return to the system what Dr.Jit keeps of freed arrays."""
+    """Return the memory of freed arrays, which Dr.Jit keeps, to the system."""
     dr.sync_thread()
     dr.flush_malloc_cache()
 
@@ -237,7 +237,7 @@ class Sky:
         return self.horizon + (self.zenith - self.horizon) * dr.maximum(dr.dot(direction, self.up), 0)
 
     def on_open_surface(self, normal: Any) -> Any:
-        """Radiance of a white diffuse surface with unit normals from all of the sky, and what lies below it.
+        """Radiance of a white diffuse surface with unit normals under the whole sky and the ground below it.
 
         The integral of max(n.w, 0) max(up.w, 0) over all directions w is 2 / 3 (sin a + (pi - a) cos a), with a
         between n and up: Cho and Saul, Kernel methods for deep learning, NIPS 2009, in three dimensions.
@@ -266,7 +266,8 @@ def _unit(vector: Any, field: str) -> NDArray[np.float64]:
 
 
 def _lights(light: Light) -> dict[str, Any]:
-    """Sun and sky for `path`, which picks one at random for each shadow ray: black ones would only add noise."""
+    """Sun and sky for `path`, which samples one at random for each shadow ray; black ones, which add noise, are
+    left out."""
     found: dict[str, Any] = {"sun": _sun(light)} if any(light.sun_irradiance) else {}
     if light.environment is not None:
         found["sky"] = _mapped(light.environment.radiance, light.environment)
@@ -276,7 +277,7 @@ def _lights(light: Light) -> dict[str, Any]:
 
 
 def _ball(vertices: Sequence[NDArray[np.float64]]) -> tuple[Any, Any]:
-    """Centre, and square of the radius, of a ball around vertices (n, 3); no smaller by rounding."""
+    """Centre, and square of the radius, of a ball around vertices (n, 3), with a margin for rounding."""
     every = np.concatenate(vertices)
     centre = 0.5 * (every.min(axis=0) + every.max(axis=0))
     square = float(np.max(np.sum((every - centre) ** 2, axis=1)))
@@ -355,7 +356,7 @@ def _texture(material: Material) -> dict[str, Any]:
 
 
 def _check(mesh: SceneMesh) -> None:
-    """Refuse what would crash the ray tracer or poison its images."""
+    """Refuse meshes that would crash the ray tracer or give invalid images."""
     count, texture = len(mesh.vertices), mesh.material.texture
     for field, values, width in (("vertices", mesh.vertices, 3), ("uv", mesh.uv, 2), ("normals", mesh.normals, 3)):
         if values is not None and (values.shape != (count, width) or not np.isfinite(values).all()):

@@ -3,11 +3,10 @@
 ``rs_pinhole`` is an ordinary Mitsuba sensor, so any Mitsuba integrator can render through it; rsbench's own
 renderers call its ``row_ray`` directly. Poses and intrinsics are data of the compiled kernel, never constants.
 
-Rays through a lens are undistorted in the kernel, in double precision, for every sample of a pixel by itself.
-The pixel centres are solved on the host. What the samples of a pixel share - its centre and the inverse derivative
-there - is computed once; from it a chord method, Newton's with that one derivative, goes the half pixel to each
-sample: no ray is interpolated. It takes the steps that the lens needs, which the host tries. NumPy:
-``rsbench.core.camera.Lens.undistort``.
+Rays through a lens are undistorted in the kernel, in double precision, for every sample of a pixel separately. The
+host solves the pixel centres, and computes the inverse derivative there once. From these the chord method
+(Newton's with a constant derivative) solves each sample, at most half a pixel away; no ray is interpolated. The
+host determines the number of steps for the lens. NumPy: ``rsbench.core.camera.Lens.undistort``.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from rsbench.core.se3 import Pose, inverse
 from rsbench.renderers.mitsuba_modules import dr, mi
 
 _EXACT_PX = 1e-8
-"""Largest error of an undistorted ray, px, in double precision; rounding to single precision errs a thousand
-times more."""
+"""Largest error of an undistorted ray, px, in double precision; that of rounding to single precision is a thousand
+times larger."""
 _MOST_STEPS = 12
 _TRIED = 65
-"""Pixels along each side of the image that the host tries, the outermost among them."""
+"""Pixels along each side of the image that the host tests, including the outermost."""
 
 
 class LensRays:
@@ -44,7 +43,7 @@ class LensRays:
         self._most = dr.opaque(mi.Float, camera.width - 1.0), dr.opaque(mi.Float, camera.height - 1.0)
         centres = camera.unproject(camera.pixel_grid())[..., :2].reshape(-1, 2)
         if lens.model == "kannala-brandt":
-            # With its tangent: a GPU's is good to single precision alone.
+            # With its tangent, which a GPU computes in single precision only.
             tangent = np.hypot(centres[:, :1], centres[:, 1:])
             centres = np.concatenate([np.arctan(tangent), tangent], axis=1)
         self._start = [mi.Float64(np.ascontiguousarray(column)) for column in centres.T]
@@ -138,12 +137,12 @@ class LensRays:
 
 @lru_cache(maxsize=2)
 def lens_rays(camera: PinholeCamera, lens: Lens) -> LensRays:
-    """The rays of a camera, made once: the host needs seconds for the centres of a million pixels."""
+    """The rays of a camera, computed once: the host needs seconds for the centres of a million pixels."""
     return LensRays(camera, lens)
 
 
 def chord_steps(camera: PinholeCamera, lens: Lens) -> int:
-    """Steps that bring the corners of pixels, the farthest places of samples, to ``_EXACT_PX``."""
+    """Number of steps after which the corners of pixels, the farthest samples, are exact to ``_EXACT_PX``."""
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     axes = (np.unique(np.linspace(0, size - 1, _TRIED).round()) for size in (camera.width, camera.height))
     middles = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 1, 2)
@@ -162,8 +161,8 @@ def chord_steps(camera: PinholeCamera, lens: Lens) -> int:
 
 PLUGIN = "rs_pinhole"
 LEAST_COMPONENT = 1e-15
-"""Smaller components of a ray's direction, which are rounding, are made 0. Embree takes one between -1e-18 and 0
-for negative and its inverse for positive: rays of its packet then miss surfaces that they meet."""
+"""Smaller components of a ray's direction, which are rounding, are set to 0. Embree treats one between -1e-18 and
+0 as negative and its inverse as positive: rays of its packet then miss surfaces."""
 
 
 def level(direction: Iterable[Any]) -> list[Any]:
@@ -181,7 +180,7 @@ def pose_table(
         rotations: (..., height, 3, 3) world-to-camera rotations, one per row; a leading axis holds the instants of
             an exposure.
         translations: (..., height, 3) metres, with ``X_cam = R @ X_world + t``.
-        columns: whether columns are read: one pose for each of them instead.
+        columns: whether columns are read, with one pose for each.
 
     Raises:
         RsbenchError: wrong shapes, or values that are not finite.
@@ -209,10 +208,10 @@ def make_sensor(
     *,
     columns: bool = False,
 ) -> Any:
-    """A Mitsuba sensor ``rs_pinhole`` with a box filter, of ``camera``'s size, at these row poses.
+    """A Mitsuba sensor ``rs_pinhole`` of ``camera``'s size with these row poses and a box filter.
 
     Args and errors: see ``pose_table``. Poses that are equal in all rows make a global shutter. ``objects`` are
-    those of objects that move, ``world_from_object``, with one more leading axis.
+    the poses ``world_from_object`` of moving objects, with one more leading axis.
     """
     sensor_class()
     film = {

@@ -147,14 +147,14 @@ def readings_page(settings: pd.DataFrame) -> str:
 
 _INTRODUCTION = """# Simulations beyond the paper
 
-Made by `rsbench reproduce sweeps`. One row per solver and value; `information` says which matches a solver was
-given (methods that see pairs and methods that see tracks through all four images are not on a par), `_low` and
-`_high` are 95 % intervals (bootstrap of 10 000 draws; shares: exact), failures score 180 degrees, `over_bound`
-is the root mean square error over its Cramer-Rao bound for that information, `bound_median` and `bound_mean` are
-those statistics of Gaussian errors at the bound, and `unobservable` names what the matches do not determine.
-Translations of solvers of the left camera are scored against that camera's own. Every row is one draw of its
-trials and none was drawn again: of the ratios of a solver at its bound one in forty lies below 1 with its
-interval, and rows that share scenes and noise, as all noises of one number of matches do, lie there together.
+Made by `rsbench reproduce sweeps`, one row per solver and value. `information` names the matches that a solver
+uses: pairs over time, or tracks through all four images, which contain more information. `_low` and `_high` are
+the ends of 95 % intervals (bootstrap of 10 000 draws; shares: exact); failures count as 180 degrees;
+`over_bound` is the root mean square error over its Cramer-Rao bound for that information; `bound_median` and
+`bound_mean` are the median and mean of Gaussian errors at the bound; `unobservable` names what the matches do
+not determine. Translations of solvers of the left camera are scored against that camera's own. No row was run
+again: by chance one in forty ratios of a solver at its bound is below 1 with its interval, and so are rows with
+the same scenes and noise (all noises of one number of matches).
 """
 SHOWN_NOISE_PX = 0.3
 

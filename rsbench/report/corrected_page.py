@@ -332,7 +332,7 @@ def draw_certainty(motion: Mapping[str, Any] | None) -> list[dict[str, Any]]:
         return []
     found, choice = list[dict[str, Any]](), motion.get("model_choice")
     if choice and len(choice["probability"]) > 1:
-        words = "Probability of each law of motion, given the matches; blue: the law that is used"
+        words = "Probability of each motion model, given the matches; blue: the model that is used"
         words += "." if choice["decided"] else ", though the matches do not decide."
         found.append({"svg": _odds(choice["probability"], choice["used"]), "caption": words})
     if motion.get("covariance_w_d") is None:
@@ -406,7 +406,7 @@ def _odds(probability: Mapping[str, float], used: str) -> Markup:
             f'<text x="{_ODDS_LEFT + _BAR + 8}" y="{y + 16}">{words}</text>'
         )
     label = "; ".join(f"{name} {p:.3g}" for name, p in probability.items())
-    return _svg(_ODDS_WIDE, _ROW * len(rows), f"probability of the laws of motion: {label}", "".join(rows))
+    return _svg(_ODDS_WIDE, _ROW * len(rows), f"probability of the motion models: {label}", "".join(rows))
 
 
 def _ellipses(covariance: FloatArray, names: tuple[str, str]) -> Markup:

@@ -67,7 +67,7 @@ def write_laws(folder: Path) -> Path:
 
 
 def laws_page(summary: pd.DataFrame, sequences: pd.DataFrame, motions: pd.DataFrame) -> str:
-    """The page of frames under several laws of motion, as Markdown.
+    """The page of frames under several motion models, as Markdown.
 
     Args:
         summary, sequences: results of ``by_law`` and ``by_sequence``.
@@ -82,11 +82,11 @@ def laws_page(summary: pd.DataFrame, sequences: pd.DataFrame, motions: pd.DataFr
 
 
 def worst_table(sequences: pd.DataFrame, motions: pd.DataFrame) -> str:
-    """A row for each law and size: the sequence with our lowest score, and the one with our largest e_T."""
+    """A row for each motion model and size: the sequences with our lowest score and with our largest e_T."""
     wide = sequences.pivot(index="sequence", columns="method", values="psnr_covered")
     errors = motions.set_index("sequence")
     head = (
-        "law, size",
+        "motion model, size",
         "least PSNR of ours",
         "uncorrected",
         "sequence",
@@ -117,7 +117,7 @@ def study_page(images: pd.DataFrame, summary: pd.DataFrame) -> str:
 
 
 def law_table(laws: pd.DataFrame, size: str) -> str:
-    """Covered PSNR, dB, for motions of one size by law; in brackets the paired gain of ours."""
+    """Covered PSNR, dB, for motions of one size by motion model; in brackets the paired gain of ours."""
     own = laws[laws["stratum"].str.endswith(f", {size}")]
     strata = list(dict.fromkeys(own["stratum"]))
     names = [stratum.partition(",")[0] for stratum in strata]

@@ -230,15 +230,14 @@ def setting_table(cards: list[SweepCard]) -> pd.DataFrame:
 
 _PAGE = """# The paper's Figure 3, made again
 
-Made by `rsbench reproduce fig3`: simulated points, bare solvers without RANSAC, the same scenes and the same
-noise for all of them. The paper's noise of "10^-3" has no unit, so each figure exists for both readings; the
-paper plots means, which a few flipped translations can dominate, so medians stand beside them. Bands are 95 %
-bootstrap intervals, 10 000 draws. All panels of an error share one scale. With a star: what lies outside the
-paper's terms, which exclude non-linear optimisation, and the same statistic of a solver whose errors are
-Gaussian and at the Cramer-Rao bound of the left and right pairs. The vertical line marks the reading. Every row
-is one draw of its trials and none was drawn again, so that of the ratios of a solver at its bound one in forty
-lies below 1 with its interval; rows of one sweep share scenes and noise, and do so together. The eight-point
-algorithm, which is biased, is below in places.
+Made by `rsbench reproduce fig3`: simulated points, solvers without RANSAC, the same scenes and noise for all of
+them. The paper's noise of "10^-3" has no unit, so each figure exists for both readings. The paper plots means,
+which a few flipped translations can dominate; medians are shown too. Bands are 95 % bootstrap intervals, 10 000
+draws. All panels of an error share one scale. A star marks what the paper excludes: non-linear optimisation, and
+the Cramer-Rao bound (the same statistic of Gaussian errors at the bound of the left and right pairs). The
+vertical line marks the reading. No row was run again: by chance one in forty ratios of a solver at its bound is
+below 1 with its interval, and so are other rows of the sweep, which share scenes and noise. The eight-point
+algorithm, which is biased, is below the bound in places.
 
 | | 10^-3 px | 10^-3 of the normalised image plane, 0.81 px |
 |---|---|---|
@@ -247,14 +246,14 @@ algorithm, which is biased, is below in places.
 
 Each is also a PDF for a column of 88 mm, with a row for each sweep: [median](fig3-px-median.pdf) and
 [mean](fig3-px-mean.pdf) of 10^-3 px, [median](fig3-normalised-median.pdf) and [mean](fig3-normalised-mean.pdf) of
-0.81 px. Sweeps stand in the order of the paper's columns: noise and baseline, whose panels hold both errors there,
+0.81 px. Sweeps are in the order of the paper's columns: noise and baseline, whose panels there have both errors,
 translation, rotation, readout. Where the two readings of the paper's solver agree, as in most e_T, the second
-covers the first; *symmetric part* reads w from the symmetric part of E. The baseline is the distance between the
-cameras; the paper may mean half of it. The eight-point algorithm sees the left camera alone and is scored against
-that camera's own translation; the others see left and right pairs.
-The tables `<sweep>.csv` hold all figures, also of scale, failures and error over bound.
-[trials.npz](trials.npz) holds what they summarise, the errors of every trial in single precision:
-`<sweep>_e_R_deg` and `<sweep>_e_T_deg` (rows, trials), whose row k is that of the table; NumPy reads it.
+covers the first; *symmetric part* takes w from the symmetric part of E. The baseline is the distance between the
+cameras; the paper may mean half of it. The eight-point algorithm uses the left camera alone and is scored against
+that camera's own translation; the others use left and right pairs.
+The tables `<sweep>.csv` have all figures, also of scale, failures and error over bound.
+[trials.npz](trials.npz) has the errors of every trial in single precision: `<sweep>_e_R_deg` and
+`<sweep>_e_T_deg` (rows, trials), whose row k is that of the table.
 
 What the paper does not state had to be chosen:
 

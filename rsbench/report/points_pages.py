@@ -1,5 +1,5 @@
-"""The tables and pages of points: on recorded trajectories (errors, coverage, and what a method chose there), and
-of public and held-out splits side by side."""
+"""Tables and pages of points: recorded trajectories (errors, coverage, chosen models), and public and held-out
+splits side by side."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from rsbench.report.markup import frame_text, words_of
 from rsbench.storage.files import write_bytes
 
 SPLINE = "continuous"
-"""What is chosen where no motion model fits."""
+"""The choice if no motion model fits."""
 LIMITS = (0.0, 1.0, 3.0, 10.0, np.inf)
-"""Classes of the departure from an even turn, in standard deviations of the noise of a match."""
+"""Classes of the departure from constant angular velocity, in standard deviations of the noise of a match."""
 _UNKNOWNS = 6
 
 
@@ -44,7 +44,8 @@ def by_recording(entries: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 
 
 def choices(split: Split, entries: Mapping[str, pd.DataFrame], method: str) -> pd.DataFrame:
-    """A row for each problem: what a method chose, its errors, and how far the rows are from an even turn.
+    """A row for each problem: the chosen model, errors, and the departure of the rows from constant angular
+    velocity.
 
     ``departure_px`` is the largest angle between the true pose of a row and that of an even turn by the true w,
     times the focal length.
@@ -264,7 +265,7 @@ def _comparison(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def others(table: pd.DataFrame) -> pd.DataFrame:
-    """The code of others: a row for each entry, with its scores on public splits, those that use least first."""
+    """Entries by other people's code, with their scores on public splits, sorted by the number of inputs."""
     found = dict[str, dict[str, str]]()
     rows = table[table["code"] != OURS].to_dict("records")
     for row in sorted(rows, key=lambda row: (row["uses"].count("+"), row["uses"])):

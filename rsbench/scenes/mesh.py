@@ -1,7 +1,7 @@
 """A scene from a mesh file of the user: glTF, GLB, OBJ, OFF, PLY or STL, read by trimesh.
 
-The model is placed: its size and place, the ground below it and walls around. Its surfaces are diffuse, or glossy
-where a glTF says how rough they are.
+The model is scaled and placed, with ground below it and walls around it if wanted. Its surfaces are diffuse, or
+glossy with the roughness of a glTF.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ from rsbench.storage.untrusted_files import check_amount, check_size
 
 _GROUND, _WALL = "cobbles", "brick"
 _SUNK = 1e-3
-"""Depth of the ground below the model, in sizes of the model: a base at its height would share its surface."""
+"""Depth of the ground below the model, in sizes of the model, so that it does not coincide with the model's
+base."""
 _APART, _HIGH = 4.0, 2.0
 """Distance from the model's axis to the walls, and their height, in sizes of the model."""
 
@@ -53,7 +54,7 @@ def standing(meshes: Sequence[SceneMesh], size: float | None) -> tuple[SceneMesh
 
 
 def box_of(meshes: Sequence[SceneMesh]) -> tuple[FloatArray, FloatArray]:
-    """Least and largest coordinates (3,) of what is seen of meshes."""
+    """Least and largest coordinates (3,) of the triangles of meshes."""
     used = [mesh.vertices[np.unique(mesh.faces)] for mesh in meshes]
     lows, highs = [part.min(axis=0) for part in used], [part.max(axis=0) for part in used]
     return np.min(lows, axis=0), np.max(highs, axis=0)
@@ -93,7 +94,7 @@ _TEXTURES = 1 << 26
 
 @dataclass(frozen=True, kw_only=True)
 class MeshBuilder(SceneBuilder):
-    """A mesh file: which, and how its axes and units become the scene frame's."""
+    """A mesh file, and the conversion of its axes and units to the scene frame."""
 
     file: str
     """Path of the mesh file, relative to the card, or absolute."""
@@ -106,9 +107,9 @@ class MeshBuilder(SceneBuilder):
     shading: Literal["flat", "smooth"] = "flat"
     """Whether triangles are shaded flat or with the file's smooth normals."""
     transparent: Literal["refuse", "opaque"] = "refuse"
-    """What becomes of surfaces that the file cuts out or blends by an alpha: only opaque ones can be rendered."""
+    """Treatment of surfaces that the file cuts out or blends by an alpha: only opaque ones can be rendered."""
     gloss: Literal["none", "file"] = "none"
-    """``file``: surfaces are as glossy as a glTF's roughness says, see ``_roughness``; ``none``: diffuse."""
+    """``file``: a clear coat with a glTF material's roughness, if that is 0.5 or less; ``none``: diffuse."""
 
     size: float | None = None
     """Longest side of the model's box, metres, whatever its units are."""
@@ -125,7 +126,7 @@ class MeshBuilder(SceneBuilder):
             if value is not None and not value > 0:
                 raise ValueError(f"{name} = {value}: must be positive")
         if self.size is not None and self.place == "file":
-            raise ValueError('size: needs place = "origin", for the file\'s own place has no size')
+            raise ValueError('size: needs place = "origin"; with place = "file" use metres_per_unit')
 
     def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
         """Meshes of a file in the scene frame, one for each part of its scene graph, textures and uv kept.
@@ -174,11 +175,11 @@ class _Look(NamedTuple):
     builder: MeshBuilder
     surfaces: dict[str, Surface]
     materials: dict[tuple[int, tuple[float, ...]], Material]
-    """Made so far, by the identity of what trimesh read and the colour that multiplies it."""
+    """Materials made so far, by the identity of trimesh's object and the colour that multiplies it."""
 
 
 def _check_size(model: Any, path: Path) -> None:
-    """Refuse what its scene graph, which may show a mesh many times, unfolds to too much."""
+    """Refuse a scene graph, which may contain a mesh many times, that is too large when expanded."""
     nodes = [model.geometry[model.graph[node][1]] for node in model.graph.nodes_geometry]
     triangles = sum(len(part.faces) for part in nodes if isinstance(part, trimesh.Trimesh))
     check_amount(f"mesh file {path}", "triangles", triangles, _TRIANGLES)
@@ -260,13 +261,13 @@ def _normals(part: Any, linear: FloatArray, where: str) -> FloatArray:
 
 
 def _unit(colours: NDArray[Any]) -> FloatArray:
-    """Colours between 0 and 1, of integers that stand for such, or floats."""
+    """Colours between 0 and 1, from integers or floats."""
     most = np.iinfo(colours.dtype).max if np.issubdtype(colours.dtype, np.integer) else 1.0
     return np.asarray(colours, dtype=np.float64) / most
 
 
 def _check_alpha(source: Any, part: Any, where: str, transparent: str) -> None:
-    """Refuse a material that is anywhere less than opaque, unless that is to be passed over.
+    """Refuse a material that is not opaque everywhere, unless alpha is to be ignored.
 
     Raises:
         RsbenchError: see above.
@@ -295,7 +296,7 @@ def _check_alpha(source: Any, part: Any, where: str, transparent: str) -> None:
 def _material(
     source: Any, surface: Surface | None, shade: FloatArray, where: str, others: list[Material]
 ) -> Material:
-    """Diffuse part of a glTF or MTL material, multiplied by ``shade``; all else that it may say is left out."""
+    """Diffuse part of a glTF or MTL material, multiplied by ``shade``; all else is ignored."""
     if source is None:
         return Material(name="plain")
     if isinstance(source, trimesh.visual.material.MultiMaterial):
@@ -318,10 +319,11 @@ def _material(
 
 
 def _roughness(source: Any, where: str) -> float | None:
-    """Of a glTF material, no less than the smoothest; above the roughest, and of other files, None: diffuse.
+    """Roughness of a glTF material, at least that of the smoothest coat; None (diffuse) above the roughest, and
+    for other files.
 
     Raises:
-        RsbenchError: metal, or a map: a coat has one roughness, and what is below it is diffuse.
+        RsbenchError: metal, or a roughness map: a coat has one roughness, on a diffuse surface.
     """
     if not isinstance(source, trimesh.visual.material.PBRMaterial):
         return None
@@ -330,7 +332,7 @@ def _roughness(source: Any, where: str) -> float | None:
             f'{where} has a map of roughness, and gloss = "file" takes one number for each material: export it '
             "without, or leave gloss out"
         )
-    # What a file does not state is 1, by glTF's specification.
+    # Absent factors are 1, by glTF's specification.
     factors = (source.metallicFactor, source.roughnessFactor)
     metal, roughness = (1.0 if each is None else float(each) for each in factors)
     if metal > 0.0:
@@ -363,7 +365,7 @@ def _coloured_faces(
     normals: FloatArray | None,
     colours: NDArray[np.uint8],
 ) -> SceneMesh:
-    """A mesh with a colour for each face, which a sheet of one texel for each colour holds."""
+    """A mesh with a colour for each face, from a texture with one texel for each colour."""
     palette, index = np.unique(colours, axis=0, return_inverse=True)
     index = np.asarray(index).ravel()
     rows = -(-len(palette) // _SHEET)

@@ -6,9 +6,9 @@ in w:
 
     m(w) . d = 0,   m(w) = c + (a (x y^T - (x.y) I) - k1 [c]x) w,   c = x cross y, a = k3 - k1
 
-Five rows have a common null vector d when all ten 3 x 3 minors vanish: ten cubics in w with 20 monomials,
-solved by elimination and an action matrix. At phi = 0 this is the linearised global-shutter five-point problem.
-The baseline is ignored, which costs |w| baseline / (2 |d|); the refinement must correct this.
+Five rows have a common null vector d when all ten 3 x 3 minors vanish: ten cubics in w with 20 monomials, solved
+by elimination and an action matrix. Without readout this is the linearised global-shutter five-point problem. The
+baseline is ignored, an error of |w| baseline / (2 |d|) that the refinement corrects.
 """
 
 from __future__ import annotations
@@ -125,21 +125,23 @@ def five_point(pairs: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
 
 _SCREEN_ITERATIONS, _SCREEN_MATCHES = 6, 150
 _LONGEST_START = 2.0
-"""Length of d in baselines that a descent on pairs starts with at most."""
+"""Largest initial length of d for pairs, in baselines."""
 _REWEIGHTINGS = (5, 5)
-"""Steps before the distribution of the errors is found again."""
+"""Steps between estimates of the distribution of the errors."""
 _LEAST_IN_FRONT = 0.75
 _AS_GOOD, _APART = 3.0, 25.0
-"""Two motions fit alike within so many standard deviations, and are two beyond so many squared ones."""
+"""Standard deviations within which two motions fit equally well, and squared ones beyond which they are
+different."""
 _NOISIER = 10.0
-"""Times the noise, with which a motion does not explain what another one does."""
+"""Ratio of the noise levels above which the motion with the larger one does not explain the matches."""
 _NEARLY_PLANAR = 0.15
-"""Share of the flow that a homography leaves, at most, for its motions to be tried; 0.2 and more off a plane."""
+"""Largest share of the flow that a homography may leave unexplained for its motions to be tried; off a plane it is
+0.2 and more."""
 _LEAST_DEPTHS = 0.7
-"""Median disparity over its deviation below which equations linear in the point do not describe its error: of such
-problems half of the stated ellipsoids of 95 % held the truth."""
+"""Median disparity over its deviation below which equations that are linear in the point do not describe its
+error: in such problems half of the stated 95 % ellipsoids contained the truth."""
 _LEAST_NOISE_PX = 0.01
-"""Noise assumed at least when judging whether data determine a rotation: exact data fit anything exactly."""
+"""Least noise in the test whether data determine a rotation, px: exact data have no residuals."""
 
 
 @final
@@ -158,21 +160,21 @@ class RefinedSolver(Solver):
     motion_parameters: dict[str, Any] = field(default_factory=dict, hash=False)
     """Parameters of the motion model; absent ones have its defaults."""
     use_tracks: bool = True
-    """Off: tracks count as unlinked left and right matches, for a fair comparison with solvers of pairs."""
+    """Off: tracks are used as unlinked left and right matches, for a fair comparison with solvers of pairs."""
     use_pairs: bool = True
-    """Off: only tracks, of which there must be three."""
+    """Off: uses only tracks, at least three."""
     one_camera: bool = False
     """Only the left camera's matches over time, and its own motion: d has no length."""
     shutter: Literal["rolling", "global"] = "rolling"
-    """Global: the same solver without readout, to see what the rolling shutter costs."""
+    """Global: the same solver without readout, to measure the effect of the rolling shutter."""
     iterations: int = 60
     """Steps of Levenberg and Marquardt, at most."""
     max_translation_m: float = 50.0
     """Longest translation per frame period; pairs alone may not bound it."""
     max_scale_sigma: float = 0.5
-    """Relative standard deviation of the length of d above which it does not count as metric."""
+    """Relative standard deviation of the length of d above which it is not metric."""
     max_direction_sigma: float = 0.5
-    """Standard deviation of the direction of d (radians) above which it does not count as known."""
+    """Standard deviation of the direction of d (radians) above which it is unknown."""
     max_rotation_sigma: float = 0.2
     """Standard deviation of the rotation (radians) above which there is no estimate."""
 
@@ -187,7 +189,7 @@ class RefinedSolver(Solver):
 
     @property
     def inner_keys(self) -> tuple[str, ...]:
-        """Another package's motion model is a part whose source is not ours."""
+        """Components inside: another package's motion model."""
         model = motion_model(self.motion_model)
         return () if model.__module__.partition(".")[0] == "rsbench" else (source_version(model),)
 
@@ -210,7 +212,7 @@ class RefinedSolver(Solver):
         )
 
     def packed(self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Packed:
-        """The measurements that this solver uses, with the shutter that it believes in."""
+        """The measurements that this solver uses, with the shutter that it assumes."""
         if self.shutter == "global":
             shutter = shutter.at_once()
         if not self.use_pairs:
@@ -292,7 +294,7 @@ class RefinedSolver(Solver):
         noise_px: float,
     ) -> MotionEstimate | None:
         if self.shutter == "global":
-            return None  # What it leaves of a rolling shutter's matches is no noise.
+            return None  # Its residuals of a rolling shutter's matches are no noise.
         packed = self.packed(correspondences, rig, shutter)
         theta = packed.theta(motion.w, motion.d)
         tailed = heavy_tailed(packed, theta, noise_px)
@@ -328,7 +330,7 @@ class RefinedSolver(Solver):
         return self._checked(packed, chosen.theta)
 
     def _checked(self, packed: Packed, theta: FloatArray) -> Minimum:
-        """Descent; when the points then lie behind the cameras, another from the opposite translation."""
+        """Descent; if the points are then behind the cameras, another from the opposite translation."""
         if len(packed.tracks) > 0:
             return self._minimise(packed, theta, self.iterations)
         # A start on fewer matches may have left the length of d at its limit, where the cost is flat.
@@ -341,7 +343,7 @@ class RefinedSolver(Solver):
         return best
 
     def _settle(self, packed: Packed, best: Minimum, rig: StereoRig) -> tuple[Minimum, bool]:
-        """The lowest of the minima that pairs of a plane allow, and whether another one fits as well."""
+        """The lowest minimum that pairs of a plane allow, and whether another one fits equally well."""
         if len(packed.tracks) > 0:
             return best, False
         starts = [_signed_start(packed, packed.pairs, w, d, rig) for w, d in planar_motions(packed.larger_side())]
@@ -354,7 +356,7 @@ class RefinedSolver(Solver):
         return lowest, False
 
     def report(self, packed: Packed, best: Minimum, rival: bool = False) -> MotionEstimate:
-        """Estimate with covariance and what the data leave open; ``rival``: another motion fits as well."""
+        """Estimate with covariance and what is not determined; ``rival``: another motion fits equally well."""
         variance = packed.noise_variance(best.cost)
         if rotation_sigma(best.H, max(variance, _LEAST_NOISE_PX**2)) > self.max_rotation_sigma:
             return MotionEstimate.failed("the rotation is not determined: degenerate matches")
@@ -367,7 +369,7 @@ class RefinedSolver(Solver):
             d, covariance = _of_unit_length(d, covariance)
         scale_sigma, direction_sigma = _translation_sigmas(d, covariance)
         at_limit = float(np.linalg.norm(best.theta[3:])) >= 0.999 * self.max_translation_m
-        # Tracks measure d in metres, however short it is; pairs only the direction of d well.
+        # Tracks give d in metres, however short it is; pairs give only its direction accurately.
         linked = len(packed.tracks) > 0
         known = scale_sigma <= self.max_scale_sigma and not at_limit and not packed.one_camera
         metric = linked or known
@@ -380,7 +382,7 @@ class RefinedSolver(Solver):
             reasons.append("no deviation can be stated: disparities are smaller than their noise")
         elif stated is not None and stated.count < FEWEST_PER_PARAMETER * packed.parameters:
             covariance = None
-            reasons.append(f"no deviation can be stated: all depends on some {stated.count:.0f} matches")
+            reasons.append(f"no deviation can be stated: {stated.count:.0f} effective matches are too few")
         if not direction_known:
             why = "another motion explains these matches as well (a plane)" if rival else "too little translation"
             reasons.append(f"the direction of d is not determined: {why}")
@@ -409,10 +411,11 @@ def _finite(packed: Packed, thetas: Iterable[FloatArray]) -> list[MotionEstimate
 
 
 def _as_good(packed: Packed, best: Minimum, other: Minimum) -> bool:
-    """Whether the pairs do not prefer one of two motions: each sees another component of the noise of a pair.
+    """Whether the pairs do not prefer one of two motions, of which each has another component of the noise as
+    residual.
 
-    Q. Vuong, Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 1989. His test
-    says nothing where few pairs have nearly all of the excess; what takes much more noise is not as good.
+    Q. Vuong, Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 1989. His test is
+    inconclusive if a few pairs cause nearly all of the difference; a motion with much more noise is then worse.
     """
     least = max(packed.noise_variance(best.cost), _LEAST_NOISE_PX**2)
     if packed.noise_variance(other.cost) > _NOISIER**2 * least:
@@ -494,7 +497,7 @@ def planar_motions(pairs: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def _signed_start(packed: Packed, pairs: FloatArray, w: FloatArray, d: FloatArray, rig: StereoRig) -> FloatArray:
-    """Give a direction a plausible length (the paper's range of motions) and the sign of cheirality."""
+    """A direction with a plausible length (the paper's range of motions) and the sign of cheirality."""
     scaled = scaled_translation(pairs, w, 10.0 * rig.baseline)
     length = 0.5 * rig.baseline
     if scaled is not None:
@@ -503,7 +506,7 @@ def _signed_start(packed: Packed, pairs: FloatArray, w: FloatArray, d: FloatArra
 
 
 def warm_up(motion_models: Iterable[str] = ("linear",)) -> None:
-    """Compile what the solvers of these motion models call, or load it where it was compiled before.
+    """Compile the code of the solvers of these motion models, or load it if it is compiled.
 
     Call it before workers start, so that they find the code on disk, and in each of them before a clock starts.
 

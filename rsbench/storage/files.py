@@ -1,7 +1,7 @@
-"""Files of a dataset: exact, deterministic bytes, written so that a killed run leaves no half file.
+"""Files of a dataset: exact, deterministic bytes, written so that a killed run leaves no incomplete file.
 
-Hashes of files are kept, so that a file of unchanged size and times is not read again. ``background_writer``
-writes on other threads while this one goes on.
+Hashes of files are stored, so that files with unchanged size and times are not read again. ``background_writer``
+writes on other threads.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ _PNG_HEAD = 33
 
 
 def write_png(path: Path, image: NDArray[np.uint8], orientation: int = 1) -> None:
-    """8-bit image (H, W, 3) RGB or (H, W), with EXIF's number of how it is to be turned for a person."""
-    import cv2  # here and below: a solve reads files, and OpenCV is a fortieth of its time
+    """8-bit image (H, W, 3) RGB or (H, W), with EXIF's orientation."""
+    import cv2  # here and below: a solve, which needs no OpenCV, imports this module
 
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     ok, data = cv2.imencode(".png", pixels)
@@ -203,8 +203,8 @@ def read_exr(
     """Channels (H, W, channels) float32 in the order of ``names``; ``size`` as in ``read_png``.
 
     Raises:
-        RsbenchError: missing, damaged, of another size, or with other content than these channels in scanlines,
-            float32, or float16 where ``half``.
+        RsbenchError: missing, damaged, of another size, or with other content than these channels in scanlines of
+            float32, or float16 if ``half``.
     """
     import OpenEXR
 
@@ -269,7 +269,7 @@ def read_pose_table(path: Path) -> FloatArray:
 
 
 def save_matches(path: Path, matches: Correspondences) -> None:
-    """The sets of all matchers, and the rare ones where the matcher gives them."""
+    """The sets of all matchers, and the rare ones if the matcher gives them."""
     rare = {name: rows for name in ("lines", "affine") if len(rows := getattr(matches, name))}
     save_arrays(path, {name: getattr(matches, name) for name in MATCH_SETS} | rare)
 
@@ -311,7 +311,7 @@ def read_table(
 
 
 def write_table(path: Path, frame: pd.DataFrame) -> None:
-    """CSV with six significant digits: enough to compare runs, few enough to read."""
+    """CSV with six significant digits."""
     write_bytes(path, frame.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode())
 
 
@@ -319,7 +319,7 @@ def write_table(path: Path, frame: pd.DataFrame) -> None:
 
 
 HASHES = f"{HIDDEN}/hashes.jsonl"
-"""File of the hashes of a folder of results, relative to it."""
+"""File of the stored hashes of a folder of results, relative to it."""
 
 
 class HashedFile(NamedTuple):
@@ -333,14 +333,14 @@ class HashedFile(NamedTuple):
 
 
 class FileHashes:
-    """SHA-256 of the files below a folder; new ones are appended to a file by ``flush``."""
+    """SHA-256 of the files below a folder; ``flush`` appends new ones to a file."""
 
     def __init__(self, root: Path, store: Path, rehash: bool = False) -> None:
         """
         Args:
             root: the folder.
             store: file of the kept hashes; need not exist.
-            rehash: forget the kept hashes.
+            rehash: ignore the stored hashes.
 
         Raises:
             RsbenchError: the store exists and is not a regular file.
@@ -376,7 +376,7 @@ class FileHashes:
         return sha256(path) if found is None else found.sha256
 
     def learn(self, name: str, digest: str) -> HashedFile:
-        """Keep the hash of a file that was just written."""
+        """Store the hash of a file that was just written."""
         found = os.stat(f"{self._root}/{name}")
         return self._keep(name, HashedFile(found.st_size, found.st_mtime_ns, found.st_ctime_ns, digest))
 
@@ -385,7 +385,7 @@ class FileHashes:
         self.append(self.taken())
 
     def taken(self) -> list[str]:
-        """New hashes as lines, for ``append`` in another process; here they are no longer new."""
+        """New hashes as lines, for ``append`` in another process; they are removed here."""
         lines = self._new
         self._new = []
         return lines
@@ -421,14 +421,15 @@ Later = Callable[..., "Future[Any]"]
 """Takes a function and its arguments, and calls it on another thread."""
 _THREADS = 2
 _WAITING = 8
-"""Most unfinished jobs: each may hold a frame's arrays, and a disk may be slower than the renderer."""
+"""Largest number of unfinished jobs: each may hold a frame's arrays, and a disk may be slower than the
+renderer."""
 
 
 @contextmanager
 def background_writer() -> Iterator[Later]:
-    """A function that runs work on other threads, such as writing beside the renderer; all is done at the end.
+    """A function that runs work on other threads, such as writing during rendering; all is done at the end.
 
-    The first error is raised at the end, or at a later call; the caller keeps the results that it needs.
+    The first error is raised at the end, or at a later call; results are those that the caller stores.
     """
     with ThreadPoolExecutor(_THREADS) as pool:
         jobs: deque[Future[Any]] = deque()

@@ -1,12 +1,12 @@
-"""Private folders of rsbench: in the user's cache, for temporary files, and hidden in a folder of results.
+"""Private folders of rsbench: in the user's cache, for temporary files, and the hidden one in a folder of results.
 
 ``.rsbench/lock`` is locked while a command works in a folder of results, and records its process and host.
 Results are written to ``.rsbench/work`` and renamed when complete. Everything in the hidden folder belongs to
 rsbench, and only there does rsbench remove whole folders: folders elsewhere are moved there first, after a check
 that rsbench wrote every file in them.
 
-The system frees the lock when its process ends, however it ends. Where the file system has no locks, or does not
-pass them on to other hosts, the owner's record counts for ``_DEAD_S`` after it was last renewed.
+The system frees the lock when its process ends, however it ends. If the file system has no locks, or none across
+hosts, the owner's record is valid for ``_DEAD_S`` after it was last renewed.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ LOCK = "lock"
 _BEAT_S = 15.0
 _TRIES = 100
 _DEAD_S = 90.0
-"""Age of the owner's record after which its process counts as dead; NFS shows changes up to 60 s late."""
+"""Age of the owner's record after which its process is taken as dead; NFS shows changes up to 60 s late."""
 
 
 @contextmanager
@@ -166,7 +166,7 @@ def _raise(error: OSError) -> NoReturn:
 
 
 def named(paths: list[str], most: int = 3) -> str:
-    """The first paths as text, and how many more there are."""
+    """The first paths as text, and the number of the others."""
     more = f" and {len(paths) - most} more" if len(paths) > most else ""
     return ", ".join(paths[:most]) + more
 
@@ -194,7 +194,7 @@ def _take(out: Path, hidden: Path) -> int:
             os.close(descriptor)
             raise
         os.close(descriptor)
-    raise RsbenchError(f"{out}: other commands come and go there; choose another folder")
+    raise RsbenchError(f"{out}: other commands keep locking it; choose another folder")
 
 
 def _refuse_foreign(hidden: Path) -> None:
@@ -227,7 +227,7 @@ def _claim(out: Path, descriptor: int) -> None:
 
 
 def _lock(descriptor: int) -> bool | None:
-    """Lock the file until its descriptor is closed; whether that succeeded, None where there are no locks."""
+    """Lock the file until its descriptor is closed; returns whether that succeeded, None without locks."""
     if sys.platform == "win32":
         return None
     import fcntl
@@ -264,8 +264,8 @@ def _beat(lock: Path, done: threading.Event) -> None:
 
 
 def _leave(hidden: Path, descriptor: int, fresh: list[Path]) -> None:
-    """Free the lock; remove the hidden folder if it holds nothing for a later run, and then ``fresh`` folders, the
-    innermost first, if they are empty."""
+    """Free the lock; remove the hidden folder if it has nothing for a later run, and then empty ``fresh`` folders,
+    the innermost first."""
     with contextlib.suppress(OSError):
         remove(hidden / WORK)
         os.ftruncate(descriptor, 0)

@@ -35,12 +35,12 @@ from rsbench.verification.rerender import RerenderedRows, Rerenderer
 from rsbench.verification.sensor_checks import sensor_faults
 
 _MOST_ELSEWHERE = 8
-"""Other sequences among whose images an exchanged one is looked for."""
+"""Number of other sequences in which the original of an exchanged image is searched."""
 
 
 @dataclass(eq=False)
 class State:
-    """One sequence under verification; each check reads from here.
+    """One sequence during verification, the input of each check.
 
     Frames are read two at a time, so that long sequences take no more memory.
     """
@@ -55,21 +55,21 @@ class State:
     notes: list[str] = field(default_factory=list)
     agreements: dict[tuple[str, str], DepthAgreement] = field(default_factory=dict)
     disagreeing: dict[Times, GeometryFault] = field(default_factory=dict)
-    """Frames whose depth maps do not agree, none by itself."""
+    """Frames whose depth maps disagree although no single map is wrong."""
     missing: Collection[str] = ()
-    """Files that a manifest lists and that are not there."""
+    """Files that a manifest lists but that are missing."""
     sequence: Sequence = field(init=False)
     """From the stage "sequence" on, as ``other_images``."""
     other_images: OtherImages = field(init=False)
-    """Images that may have been exchanged with its own."""
+    """Images with which its own may have been exchanged."""
     fresh: Content = field(init=False)
-    """The frames that were read last: both of the first two, then one at a time. From the stage "masks" on."""
+    """The frames that were read last: the first two together, then one at a time. From the stage "masks" on."""
     twins: Content = field(init=False)
     """Their global-shutter twins at other rows than the first."""
     content: Content = field(init=False)
-    """The last two frames, without what earlier checks found wrong. From the stage "frames" on."""
+    """The last two frames, without files that earlier checks found wrong. From the stage "frames" on."""
     masks_by_rays: bool = False
-    """Whether the masks of ``fresh`` and ``twins`` are those that rays meet, not those that are stored."""
+    """Whether the masks of ``fresh`` and ``twins`` come from traced rays, not from files."""
     rerendered: RerenderedRows | None = None
 
     @property
@@ -79,11 +79,11 @@ class State:
 
     @property
     def all_content(self) -> Content:
-        """The last two frames, and the twins of what was read last."""
+        """The last two frames, and the twins of ``fresh``."""
         return with_twins(self.content, self.twins)
 
     def open(self) -> None:
-        """Read sequence.json, after the files of the sequence were looked for.
+        """Read sequence.json, after the check that the files exist.
 
         Raises:
             RsbenchError: it cannot be read.
@@ -94,7 +94,7 @@ class State:
         self.other_images = images_of_others(self.sequence, self._other_sequences)
 
     def _other_sequences(self) -> Iterator[Sequence]:
-        """Some sequences of the dataset, the nearest in the list first."""
+        """Some other sequences of the dataset, the nearest in the list first."""
         names = self.listing.names
         place = names.index(self.name)
         around = range(max(place - _MOST_ELSEWHERE, 0), min(place + _MOST_ELSEWHERE + 1, len(names)))
@@ -105,7 +105,7 @@ class State:
 
 
 def picture_faults(state: State) -> Iterator[Finding]:
-    """What depth maps and images of two successive frames show that the others contradict."""
+    """Faults in depth maps and images of two successive frames that the others contradict."""
     content, again = state.content, state.again
     comparison = Comparison(content, state.stride)
     for agreement in comparison.pairs():
@@ -126,7 +126,7 @@ def picture_faults(state: State) -> Iterator[Finding]:
 
 
 def geometry_faults(state: State) -> Iterator[Finding]:
-    """What the frames that do not agree show of sequence.json, or of one of them."""
+    """Faults of sequence.json, or of single frames, from the frames that disagree."""
     if not state.disagreeing:
         return
     first = min(state.disagreeing.values(), key=lambda each: (each.over_time, each.share))
@@ -140,28 +140,28 @@ def geometry_faults(state: State) -> Iterator[Finding]:
 
 Stage = Literal["dataset", "files", "sequence", "masks", "frames", "channels", "matcher", "rays"]
 """When a check runs: once for a dataset ("dataset") or a sequence ("files", before it is opened, and "sequence"),
-or for each two successive frames. "masks" may change the masks of what was just read; what "channels" find is
-dropped where rays make the file again bit for bit; "rays" come last."""
+or for each two successive frames. "masks" may change the masks of the frames just read; findings of "channels" are
+dropped if traced rays reproduce the file bit for bit; "rays" come last."""
 Run = Callable[[State], Iterable[Finding]]
 
 
 @dataclass(frozen=True)
 class Check:
-    """One check; docs/explanation/verification.md says what it reads, finds and costs."""
+    """One check; docs/explanation/verification.md lists what it reads, finds and costs."""
 
     name: str
     stage: Stage
     run: Run
     at_end: Run | None = None
-    """What it finds when all frames were seen."""
+    """Further findings after all frames."""
 
     def found(self, findings: Iterable[Finding]) -> Iterator[Finding]:
-        """Findings that say which check found them."""
+        """Findings with the name of the check."""
         return (replace(each, check=self.name) for each in findings)
 
 
 def _masks_by_rays(state: State) -> list[Finding]:
-    """Replaces the masks by those that rays meet, where the scene can be built."""
+    """Replace the masks by those of traced rays, if the scene can be built."""
     known = [known_gloss(each, state.again) for each in (state.fresh, state.twins)]
     state.masks_by_rays = all(derived for _, derived in known)
     return [each for findings, _ in known for each in findings]
@@ -231,7 +231,7 @@ STEPS = len(VIEW_PAIRS)
 
 
 def run_stage(state: State, stage: Stage) -> None:
-    """Run the checks of one stage; each knows what those before it found."""
+    """Run the checks of one stage; each has the findings of those before it."""
     for check in CHECKS:
         if check.stage == stage:
             state.findings += check.found(check.run(state))
@@ -241,7 +241,7 @@ def check_sequence(state: State) -> None:
     """Run all checks of one sequence.
 
     Raises:
-        RsbenchError: a file without which nothing can be checked any further cannot be read.
+        RsbenchError: a file that all further checks need cannot be read.
     """
     run_stage(state, "files")
     state.open()
@@ -262,9 +262,9 @@ def check_sequence(state: State) -> None:
 
 
 def _check_channels(state: State) -> None:
-    """Run the checks of channels; drop what they found in files that rays make again bit for bit, with a note.
+    """Run the checks of channels; drop findings, with a note, in files that traced rays reproduce bit for bit.
 
-    Rays say nothing of what the pictures do not show, and so clear no file of what the matcher says.
+    Rays show nothing that is not in the pictures, so they refute no finding of the matcher's check.
     """
     first = len(state.findings)
     run_stage(state, "channels")

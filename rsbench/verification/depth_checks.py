@@ -1,4 +1,4 @@
-"""Depth maps against each other: every pixel's surface must lie where its partners see it."""
+"""Compare depth maps with each other: every pixel's surface must be where the other maps (partners) see it."""
 
 from __future__ import annotations
 
@@ -33,31 +33,34 @@ from rsbench.verification.reprojection import (
 Bits = NDArray[np.uint8]
 
 _SPARE_PIXELS, _SPARE_SHARE = 30, 0.3
-"""Pixels of a pair that may disagree: what is thinner than a pixel lies before what is flat. A wrong geometry
-shows in the median too."""
+"""Share and number of pixels of a pair that may disagree, due to things thinner than a pixel in front of flat
+ones. A wrong geometry shows in the median too."""
 _STRICT_SHARE = 0.01
 """The same, where nearly all pairs of a kind must exceed it."""
 _TYPICAL = 5e-6
-"""Largest typical relative difference of agreeing depths: bilinear interpolation on what counts as flat errs by a
-quarter of ``FLATNESS`` at most, float32 by 6e-8."""
+"""Largest median relative difference of agreeing depths: bilinear interpolation on flat surfaces errs by at most a
+quarter of ``FLATNESS``, float32 by 6e-8."""
 _BAD_SHARE, _BAD_IN_ROW, _EMPTY_SHARE = 0.2, 0.5, 0.05
-"""Shares of the comparable pixels of a map, a row, that thin things may contradict: they are seen by one alone."""
+"""Shares of the comparable pixels of a map, and of a row, that may be contradicted, due to thin things that only
+one map shows."""
 _MOST_BEHIND = 0.3
-"""Share of a map that may lie behind what two partners see: near things hide much of it when the rig moves far."""
+"""Share of a map that may be behind surfaces that two partners see: near objects hide large areas if the rig moves
+far."""
 _FEW = 6
-"""Contradicted pixels in one row, or missing ones in a map, that thin things may leave."""
+"""Number of contradicted pixels in one row, or missing ones in a map, that thin things may cause."""
 _MANY = 4
-"""Pairs, of 8 between the cameras and 16 others, that say that the geometry is wrong and not a map."""
+"""Number of disagreeing pairs, of 8 between the cameras and 16 others, with which the geometry is wrong, not a
+map."""
 _OVER_TIME = "motion, readout_ratio and scan"
 """Keys of sequence.json on which pairs of one camera depend; ``_across`` has those of pairs of both."""
 _TILE, _BAD_IN_TILE = 5, 12
-"""A square of 5 x 5 pixels in which 12 are contradicted, and more than agree, is no edge."""
+"""A 5 x 5 square with 12 contradicted pixels, and fewer that agree, is no edge."""
 _HOLE, _HITS_IN_HOLE = 7, 8
 
 
 @dataclass(eq=False)
 class DepthEvidence:
-    """What the partners of one depth map show of its pixels, gathered pair by pair."""
+    """Evidence of the partners on the pixels of one depth map, collected pair by pair."""
 
     map: DepthMap
     stride: int
@@ -83,7 +86,7 @@ class DepthEvidence:
 
 @dataclass(frozen=True, eq=False)
 class MapFault:
-    """What is wrong with one map."""
+    """A fault of one map."""
 
     what: str
     rows: BoolArray
@@ -91,15 +94,15 @@ class MapFault:
     share: float
     """Share of the compared pixels that is wrong: the map with the largest share is reported first."""
     uncompared: bool = False
-    """Whether it has a surface, and nothing of it could be compared."""
+    """Whether it has a surface of which nothing could be compared."""
 
 
 def compare(source: DepthEvidence, target: DepthEvidence, reprojection: Reprojection) -> DepthAgreement:
-    """Add what one pair shows to the evidence of both, and count how the flat surfaces of both agree.
+    """Add the result of one pair to the evidence of both maps, and count the agreement of their flat surfaces.
 
-    What one source pixel spans must be half a pixel wide in the target in every direction: a surface seen at a
-    grazing angle there may slip between two pixels, however flat and large the source sees it. What is not flat
-    may slip between the pixels of a partner that sees nothing there.
+    A source pixel must span half a pixel in the target in every direction: a surface that the target sees at a
+    grazing angle may lie between two pixels, however flat and large it is in the source. A surface that is not
+    flat may lie between the pixels of a partner that sees nothing there.
     """
     apart = np.zeros(reprojection.relative.shape, dtype=np.float32)
     work = partial(
@@ -127,9 +130,9 @@ def compare(source: DepthEvidence, target: DepthEvidence, reprojection: Reprojec
 def map_faults(
     evidence: Mapping[ImageView, DepthEvidence], right: Collection[ImageView] = ()
 ) -> dict[ImageView, MapFault]:
-    """The maps that are wrong: the worst first, and then the others without what it says of them.
+    """The wrong maps: the worst first, then the others, judged without its evidence.
 
-    Those that are known to be ``right`` are none of them.
+    Maps known to be ``right`` are not reported.
     """
     found: dict[ImageView, MapFault] = {}
     while True:
@@ -145,15 +148,15 @@ def map_faults(
 
 
 def _fault(evidence: DepthEvidence, wrong: Collection[ImageView]) -> MapFault | None:
-    """What the partners that are not wrong themselves say against a map."""
+    """Evidence against a map of partners that are not wrong themselves."""
     trusted = np.uint8(sum(int(evidence.bit(each)) for each in evidence.map.view.partners() if each not in wrong))
     height, surface = len(evidence.map.depth), evidence.surface
     holes = np.bitwise_count(evidence.holes & trusted) >= 2
     seen = evidence.map.depth > 0
-    # Gaps narrower than a pixel, between battlements or leaves, lie one by one among pixels that see a surface.
+    # Gaps narrower than a pixel, as between leaves, are single pixels among pixels with a surface.
     holes &= _emptied(holes, seen) | (np.sum(holes) > _EMPTY_SHARE * np.sum(seen))
     if np.sum(holes) > _FEW:
-        share = 1.0 + float(np.mean(holes[evidence.holes > 0]))  # before all others: holes accuse who sees through
+        share = 1.0 + float(np.mean(holes[evidence.holes > 0]))  # first: holes contradict maps that see through
         return MapFault(
             f"{np.sum(holes)} pixels have no depth where others see a surface", np.any(holes, axis=1), share
         )
@@ -182,9 +185,9 @@ def _fault(evidence: DepthEvidence, wrong: Collection[ImageView]) -> MapFault | 
 
 
 def _bad_rows(bad: BoolArray, good: BoolArray, near: BoolArray) -> BoolArray:
-    """(h,) rows of a map that are wrong: by themselves, in a cluster, or because all of it is.
+    """(h,) rows of a map that are wrong: single ones, in a cluster, or all.
 
-    A row or two may be a thing thinner than the rows of others, unless it is ``near`` what they see.
+    One or two rows may show a thing thinner than the rows of others, unless it is ``near`` what they see.
     """
     count, comparable = np.sum(bad, axis=1), np.sum(bad | good, axis=1)
     rows = (count >= _FEW) & (count > _BAD_IN_ROW * comparable)
@@ -202,7 +205,7 @@ def _runs(rows: BoolArray) -> BoolArray:
 
 
 def _emptied(holes: BoolArray, seen: BoolArray) -> BoolArray:
-    """(H, W) missing pixels in squares of 7 x 7 that see nothing at all, 8 of which others see covered."""
+    """(H, W) missing pixels in 7 x 7 squares without any depth, in which partners see a surface at 8 pixels."""
     size = (_HOLE, _HOLE)
     hit = cv2.boxFilter(np.asarray(holes, np.float32), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
     empty = cv2.dilate(np.asarray(seen, np.uint8), np.ones(size, np.uint8)) == 0
@@ -211,7 +214,7 @@ def _emptied(holes: BoolArray, seen: BoolArray) -> BoolArray:
 
 
 def _clusters(bad: BoolArray, good: BoolArray) -> BoolArray:
-    """(h, w) contradicted pixels that lie together, more than agree there."""
+    """(h, w) contradicted pixels in clusters with fewer agreeing ones."""
     wrong, right = (
         cv2.boxFilter(
             np.asarray(each, np.float32), -1, (_TILE, _TILE), normalize=False, borderType=cv2.BORDER_CONSTANT
@@ -223,7 +226,7 @@ def _clusters(bad: BoolArray, good: BoolArray) -> BoolArray:
 
 
 class GeometryFault(NamedTuple):
-    """What the maps of two frames say against the geometry of sequence.json."""
+    """Evidence of the maps of two frames against the geometry of sequence.json."""
 
     what: str
     cause: str
@@ -243,7 +246,7 @@ def _across(rig: StereoRig) -> str:
 def geometry_fault(
     pairs: list[tuple[ImageView, ImageView, DepthAgreement]], rig: StereoRig
 ) -> GeometryFault | None:
-    """What the maps say against the geometry that sequence.json states, where none of them is wrong by itself."""
+    """Evidence against the geometry in sequence.json, if no single map is wrong."""
     wrong = [(source, target) for source, target, each in pairs if not _agree(each, _STRICT_SHARE)]
     across = sum(source.side != target.side for source, target in wrong)
     if not across and len(wrong) >= 2 * _MANY:
@@ -261,7 +264,7 @@ def geometry_fault(
 
 
 def _agree(agreement: DepthAgreement, spare: float = _SPARE_SHARE) -> bool:
-    """A pair with nothing to compare says nothing."""
+    """A pair with nothing to compare is no evidence."""
     wrong = agreement.compared - agreement.agreeing
     few = wrong <= _SPARE_PIXELS + spare * agreement.compared
     return few and not agreement.typical > _TYPICAL
@@ -270,7 +273,7 @@ def _agree(agreement: DepthAgreement, spare: float = _SPARE_SHARE) -> bool:
 def pair_faults(
     pairs: list[tuple[ImageView, ImageView, DepthAgreement]], wrong: Collection[ImageView], rig: StereoRig
 ) -> Iterator[Finding]:
-    """Pairs that disagree though neither map is contradicted by all who see it."""
+    """Pairs that disagree although neither map is contradicted by all partners."""
     for source, target, agreement in pairs:
         if _agree(agreement) or {source, target} & set(wrong):
             continue
@@ -284,13 +287,13 @@ def pair_faults(
 
 _TRIED_PIXELS = 20_000
 _EXPLAINED = 0.8
-"""Share of the comparable pixels that a candidate must explain, and 0.3 more than the map as it is."""
+"""Share of the comparable pixels that a candidate must explain, and 0.3 more than the stored map does."""
 
 Depth = NDArray[np.float32]
 
 
 def likely_cause(sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: ImageView, rows: BoolArray) -> str:
-    """In words, "" where nothing explains it. ``rows`` (H,) are those that are wrong."""
+    """The likely cause in words, "" if no candidate explains it. ``rows`` (H,) are the wrong ones."""
     depth = maps[view].depth
     if not np.any(depth[rows]):
         return "zeroed"
@@ -317,7 +320,7 @@ def likely_cause(sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: I
 def _depth_candidates(
     sequence: Sequence, maps: Mapping[ImageView, DepthMap], view: ImageView
 ) -> Iterator[tuple[str, DepthMap, Sequence]]:
-    """Depth maps that the stored one may have been, or the views whose depth it may be, and sequences."""
+    """Depth maps of other views and sequences with which the stored one may have been exchanged."""
     for words, candidate in _changed_maps(sequence, maps, view):
         yield words, candidate, sequence
     shutter = sequence.shutter
@@ -379,7 +382,7 @@ def _agreeing(sequence: Sequence, source: DepthMap, partners: list[DepthMap], ro
 def _scale(
     sequence: Sequence, source: DepthMap, partners: list[DepthMap], rows: BoolArray
 ) -> tuple[float, float, float]:
-    """Factor that the depth has too much, the share that agrees without it, and the scatter that is left."""
+    """Factor by which the depth is too large, the share that agrees without it, and the remaining scatter."""
     scale, share, spread = 1.0, 0.0, 0.0
     for _ in range(5):
         scaled = replace(source, depth=(source.depth / np.float32(scale)).astype(np.float32))
@@ -397,21 +400,21 @@ def _scale(
 
 
 _NEAR_DEPTH = 5e-3
-"""Relative difference of two depths that may be of one thin thing."""
+"""Largest relative difference of two depths of one thin thing."""
 _JUMP, _JUMPS = 3e-2, 0.5
 """Relative second difference of inverse depth at an edge, and the share of pixels beside one in a picture of thin
 things: 0.69 to 0.85 in the scene ``forest`` at 63 to 128 px, 0.35 in ``castle`` at 128 px, 0.05 at 900 px."""
 _LIKER, _AWAY = 1.6, 7
-"""How many times as many pixels two partners must see where they are than up to 7 px beside. Sound maps of
-``forest`` and ``old-town`` at 52 to 96 px: 2.3 and more. Scaled by 1.02, flipped, of the other frame: 0.6 to 1.5
-in ``forest``."""
+"""Least ratio of the pixels that agree with two partners to those that agree after a shift by up to 7 px. Valid
+maps of ``forest`` and ``old-town`` at 52 to 96 px: 2.3 and more. Scaled by 1.02, flipped, of the other frame: 0.6
+to 1.5 in ``forest``."""
 
 
 def roughly_agree(geometry: Geometry, maps: Mapping[ImageView, DepthMap], view: ImageView) -> bool:
-    """Whether a depth map shows thin things, and two partners see them about where they are.
+    """Whether a depth map shows thin things that two partners see at about the same place.
 
-    A map that could show flat places and shows none is spoilt. One partner alone may be damaged likewise:
-    rows of a frame and of its global-shutter twin lie hardly apart.
+    A map of a flat scene without flat places is damaged. A single partner may be damaged in the same way: rows of
+    a frame and of its global-shutter twin are almost equal.
     """
     alike = (_roughly_alike(geometry, maps[view], maps[each]) for each in view.partners() if each in maps)
     return maps[view].share_of_edges(_JUMP) > _JUMPS and sum(alike) >= 2
@@ -437,16 +440,16 @@ def _share_of_depth(target: DepthMap, middle: NDArray[np.int64], depth: FloatArr
 
 
 _AGREE, _LEAST = 0.8, 50
-"""Share of the comparable pixels that agree where both maps are at their places, and how many there must be."""
+"""Least share of agreeing pixels, and least number of comparable ones, of maps of the stated times."""
 _BESIDE = 4
 """Frames before and after with which a frame is compared, the nearest first."""
 _FARTHEST = 32
 
 
 def frames_of_other_times(sequence: Sequence, apart: Collection[Times]) -> list[Finding]:
-    """A finding for each frame, of those ``apart`` from one beside it, that is that of another time.
+    """A finding for each of the frames ``apart`` (in disagreement with a neighbour) that shows another time.
 
-    A frame is in order if it agrees with any other one near it, other than those from which it is ``apart``.
+    A frame is in order if it agrees with any other one near it.
     """
     maps = _MapsOverTime(sequence)
     suspects = sorted({frame for times in apart for frame in times})
@@ -461,7 +464,7 @@ def frames_of_other_times(sequence: Sequence, apart: Collection[Times]) -> list[
 
 
 def _time_of(maps: _MapsOverTime, frame: int, others: list[int]) -> int | None:
-    """The time at which a frame that agrees with none at its own does."""
+    """The time at which a frame agrees with others, if it does not at its own."""
     beside = sorted(others, key=lambda other: abs(other - frame))[: 2 * _BESIDE]
     times = sorted(range(maps.sequence.frames), key=lambda other: abs(other - frame))[1 : _FARTHEST + 1]
     pairs = ((time, other) for time in times for other in beside if other not in (frame, time))
@@ -480,7 +483,7 @@ class _MapsOverTime:
 
     def __init__(self, sequence: Sequence) -> None:
         self.sequence = sequence
-        # Of functions, not of methods: these would keep the maps in a circle until a garbage collection.
+        # Functions, because caches of methods would keep the maps, in a cycle, until a garbage collection.
         self._map = cache(partial(_left_map, sequence))
         self._share = cache(partial(_share_alike, sequence, self._map))
 
@@ -490,19 +493,19 @@ class _MapsOverTime:
         return others[1 : 2 * _BESIDE + 1]
 
     def agree(self, frame: int, time: int, other: int) -> bool:
-        """Whether the map of a frame, as if it were that of a time, agrees with the map of another frame."""
+        """Whether the map of a frame, placed at a time, agrees with the map of another frame."""
         share, count = self._share(frame, time, other)
         return count >= _LEAST and share > _AGREE
 
     def seen(self, frame: int) -> bool:
-        """Whether another one near it sees what it sees."""
+        """Whether it agrees with another frame near it."""
         return any(self._share(frame, frame, other)[1] >= _LEAST for other in self.near(frame))
 
 
 def _share_alike(
     sequence: Sequence, map_of: Callable[[int], DepthMap | None], frame: int, time: int, other: int
 ) -> tuple[float, int]:
-    """Share of the comparable pixels of two frames that agree, and how many these are."""
+    """Share of the comparable pixels of two frames that agree, and number of comparable ones."""
     source, target = map_of(frame), map_of(other)
     if source is None or target is None:
         return 0.0, 0

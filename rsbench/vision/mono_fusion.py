@@ -1,13 +1,13 @@
-"""Two rolling-shutter frames of one camera to the image at one time: geometry where it holds, flow where not.
+"""The image at one time from two rolling-shutter frames of one camera: by geometry where it holds, else by flow.
 
-A pixel of the scene at rest has one unknown, its inverse depth: found along its own epipolar curve
-(``epipolar_search``), where the other frame confirms it; else by the dense flow, where that returns to its start
-and ends on the curve; in a band along the border, by extending the surface beside it (``continued``); else it is
-that of the farther neighbour in its row. What consistent flow carries off the curve moves by itself: it is moved
-by its flow, scaled by the times of the rows. Both displacements are weighted by their variances; where consistent
-flow as a whole is off the curves, the law of motion does not hold, and flow moves everything. Each frame is drawn
-at the target, the nearer surface first, and what the first frame leaves empty is taken from the other one, moved
-to the same time, where its place was measured.
+A static pixel has one unknown, its inverse depth. It is searched along the pixel's epipolar curve
+(``epipolar_search``) and used if the other frame confirms it; else it follows from the dense flow, if that is
+consistent (returns to its start) and ends on the curve; in a band along the border, from the surface beside it
+(``continued``); else it is that of the farther neighbour in the row. Pixels whose consistent flow ends off the
+curve move independently, along their flow, scaled by the row times. Both displacements are weighted by their
+variances; if consistent flow in general ends off the curves, the motion model does not hold, and all pixels move
+along their flow. Each frame is drawn at the target time, nearer surfaces in front; holes are filled from the other
+frame, moved to the same time, where its pixels were measured.
 """
 
 from __future__ import annotations
@@ -55,19 +55,19 @@ from rsbench.vision.stereo_depth import fill_holes
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 _FITTED, _WIDEST = 0.125, 0.15
-"""Shares of the image's height or width: what a line is fitted to beside a band, and the widest band."""
+"""Shares of the image's height or width: length beside a band to which a line is fitted, and widest band."""
 _BESIDE = 1 / 16
-"""Columns to either side, of the width, whose slopes count."""
+"""Columns on either side whose slopes are used, as a share of the width."""
 _ON_LINE = 0.05
-"""Root mean square off the line, of the inverse depth there, up to which there is one."""
+"""Largest root mean square deviation from the line, relative to the inverse depth."""
 _MOST = 1.5
-"""Times the largest inverse depth that is known."""
+"""Largest extended inverse depth over the largest known one."""
 _START = 5
-"""Pixels whose median the line goes through, in their middle."""
+"""Number of pixels through whose median, in their middle, the line passes."""
 
 
 def continued(rho: F32) -> F32:
-    """Inverse depth (h, w), NaN where it is unknown, with bands along the border that are unknown filled."""
+    """Inverse depth (h, w), NaN where unknown, after unknown bands along the border were filled."""
     if not np.any(np.isfinite(rho)):
         return rho
     most = _MOST * float(np.nanmax(rho))
@@ -77,7 +77,7 @@ def continued(rho: F32) -> F32:
 
 
 def _below(rho: F32, most: float) -> F32:
-    """``rho`` (h, w) with the unknown lower ends of columns filled, where what is above them is a line."""
+    """``rho`` (h, w) with the unknown lower ends of columns filled, if the values above are on a line."""
     height, width = rho.shape
     known = np.isfinite(rho)
     last = np.where(known.any(axis=0), height - 1 - np.argmax(known[::-1], axis=0), -1)
@@ -106,26 +106,27 @@ def _below(rho: F32, most: float) -> F32:
 
 
 _RETURNS_PX = 1.0
-"""Distance from a pixel to where flow there and back ends, below which the flow is believed."""
+"""Distance, px, between a pixel and the end of the flow there and back, below which the flow is consistent."""
 _ON_CURVE_PX = 1.5
-"""Distance between the end of the flow and the epipolar curve, below which the flow is that of a still point."""
+"""Distance, px, between the end of the flow and the epipolar curve, below which the point is static."""
 _SIGMA_PX = 0.3
-"""Error of a flow that neither check detects: its standard deviation on rendered frames where both agree."""
+"""Standard deviation, px, of the error of flow that passes both checks, on rendered frames."""
 _RANGE_QUANTILE, _RANGE_MARGIN, _RANGE_PX = 0.999, 1.5, 2.0
-"""Range of the search along the curves, from the inverse depths of consistent flow: times, and px of parallax."""
+"""Range of the search along the curves around the inverse depths of consistent flow: a factor, and px of
+parallax."""
 _SAME_PX = 2.0
-"""Parallax by which a search and a flow that both are believed may differ, for the flow's depth to stand: it is
-finer than planes."""
+"""Largest difference of parallax, px, between a confirmed search and consistent flow at which the depth of the
+flow is used, which is finer than the planes."""
 _CONFIRMED = 16.0
-"""How much less flow counts where the search on the curve is confirmed by the other frame."""
+"""Factor on the variance of flow where the other frame confirms the search."""
 _LAWFUL, _DISTRUST = 2.0, 50.0
-"""Median distance of the flow from the curve, over that by which it does not return, up to which the law of motion
-holds: 0.6 to 1.5 on published pairs whose motion a law describes, with noise and blur of a sensor too, and 6.5 on
-one whose motion none does. And variance of the geometry, over the square of what is beyond, px."""
+"""Largest ratio of the flow's median distance from the curve to its median inconsistency with which the motion
+model holds: 0.6 to 1.5 on published pairs that a motion model describes, also with sensor noise and blur, and 6.5
+on one that none describes. And variance of the geometry over the square of the excess, px."""
 _SMOOTH_PX = 5
 _STRETCH = 2.5
-"""px between neighbours at the target, above which what lies between them is not seen: an edge uncovers it there.
-Between 2 and 3: on rendered frames 2 gained 0.05 dB over 3, on real ones it lost as much."""
+"""Distance, px, of neighbours at the target above which the area between them is uncovered by an edge. Between 2
+and 3: on rendered frames 2 gained 0.05 dB over 3, on real ones it lost as much."""
 _BEHIND = 1.02
 _FLOW_BYTES = 100.0
 _BLOCK, _BLOCKS_AROUND = 8, 4
@@ -134,7 +135,7 @@ it, in blocks, which is more than one that is stretched by ``_STRETCH`` covers."
 
 
 class Flows(NamedTuple):
-    """Dense flow of both frames (H, W) of one camera, in pixels of the size (h, w) at which it was found.
+    """Dense flow of both frames (H, W) of one camera, in pixels of the size (h, w) at which it was estimated.
 
     Large frames are shrunk for it by ``reduction``.
     """
@@ -166,21 +167,21 @@ class Flows(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class MonoFusionOptions:
-    """How two frames of a camera become one image."""
+    """Options of the correction."""
 
     sweep: SweepOptions = field(default_factory=SweepOptions)
     """The search along the epipolar curves."""
     warp: WarpOptions = field(default_factory=WarpOptions)
-    """How pixels are taken from the source image; ``tear_px`` is not used."""
+    """Resampling of the source image; ``tear_px`` is not used."""
     fill: bool = True
-    """Whether the other frame fills what the corrected one does not see."""
+    """Whether the other frame fills holes."""
     inpaint: bool = True
-    """Whether to inpaint what no frame shows; it stays marked as seen by nobody."""
+    """Whether to inpaint pixels that no frame shows; the mask still marks them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OwnMotion:
-    """What one camera did over two frames."""
+    """The camera and its motion over two frames."""
 
     rig: StereoRig
     """Its body is where that camera is."""
@@ -188,7 +189,7 @@ class OwnMotion:
     """Reads rows."""
     side: Side
     motion: Motion | None
-    """In its own unit of length; None: unknown, and every pixel is moved by its flow."""
+    """Motion, in its own unit of length; None: unknown, and every pixel moves along its flow."""
     far: bool = False
     """Whether to treat everything as infinitely far, whatever the flow."""
 
@@ -208,14 +209,14 @@ def find_flows(images: Sequence[NDArray[Any]]) -> Flows:
 
 
 class _Layer(NamedTuple):
-    """What is known of the pixels of one frame, whatever the target."""
+    """Depth and weights of the pixels of one frame, for all target times."""
 
     rho: F32
     """(H, W) inverse depth in each row's own camera."""
     flow_share: F32
     """(H, W) weight of the scaled flow beside that of the geometry, 0 to 1."""
     measured: Mask
-    """(H, W) whether search or flow found the place of the pixel, and not its neighbours."""
+    """(H, W) whether the depth of the pixel was measured by search or flow, not taken from neighbours."""
 
 
 class Beyond(NamedTuple):
@@ -245,10 +246,10 @@ class MonoFusion:
     def corrected(
         self, frame: int, target_tau: float, beyond: Beyond | None = None, places: FloatArray | None = None
     ) -> Fused:
-        """The frame at a time, in frame periods; its depth is in the motion's unit.
+        """The frame corrected to a time, in frame periods; its depth is in the motion's unit.
 
         Args:
-            beyond: another pair that contains the frame, whose other frame may show what neither frame here does.
+            beyond: another pair that contains the frame, whose other frame may fill the remaining holes.
             places: ``places`` of the frame at that time if they are known.
         """
         places = self.places(frame, target_tau) if places is None else places
@@ -261,7 +262,7 @@ class MonoFusion:
             wanted = empty | stretched
             other, behind, how = pair._drawn(1 - same, pair.places(1 - same, tau, wanted), wanted)
             behind *= _unit(self._layers[frame].rho, pair._layers[same].rho)
-            # An edge uncovers what is farther than itself.
+            # An edge uncovers a farther surface.
             take = (how == Origin.HERE) & (empty | (stretched & (behind <= _BEHIND * buffer)))
             image[take], buffer[take], origin[take] = other[take], behind[take], Origin.OTHER_FRAME
         empty = origin == Origin.NOBODY
@@ -495,15 +496,15 @@ def _layer(
 ) -> _Layer:
     """Depth and weights (H, W) of a frame.
 
-    ``off`` (h, w) says where its flow returns, ``rho`` and ``miss`` (h, w) are those of ``_triangulated``, and
-    ``same`` is a difference of inverse depth.
+    ``off`` (h, w) is the inconsistency of its flow, ``rho`` and ``miss`` (h, w) are those of ``_triangulated``,
+    and ``same`` is a difference of inverse depth.
     """
     full = shape[1::-1]
     still = (off < _RETURNS_PX) & (miss < _ON_CURVE_PX)
     searched = swept.agrees & ~(still & (np.abs(rho - swept.rho) < same))
     found = continued(np.where(searched, swept.rho, np.where(still, rho, np.float32(np.nan))))
     filled = cv2.resize(cv2.medianBlur(_filled(found), 5), full, interpolation=cv2.INTER_LINEAR)
-    # How far consistent flow ends off the curve says how far geometry is from explaining it, found or not.
+    # The distance of consistent flow from the curve measures the error of the geometry.
     wrong = np.maximum(miss - _ON_CURVE_PX, np.float32(0.0))
     medians = np.median([miss[still], off[still]], axis=1) if np.any(still) else np.zeros(2)
     unexplained = max(float(medians[0] - _LAWFUL * medians[1]), 0.0)

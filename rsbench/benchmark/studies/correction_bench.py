@@ -69,11 +69,11 @@ class Method:
     key: str
     title: str
     kind: str
-    """``none``, ``baseline``, ``ours``, ``law`` (ours, given a law of motion) or ``oracle``."""
+    """``none``, ``baseline``, ``ours``, ``law`` (ours, given a motion model) or ``oracle``."""
     knows: str
     """What it assumes or is given."""
     slow_scores: bool = False
-    """Whether FLIP and the SSIM of others' protocols are computed: of the best of each family."""
+    """Whether FLIP and the SSIM of other protocols are computed, for the best of each family."""
 
 
 METHODS = (
@@ -274,7 +274,7 @@ class Bench:
         self, pairs: Pairs, motion: Motion, corrector: str = "fusion", views: tuple[View, ...] = VIEWS
     ) -> tuple[dict[View, Fused], Pairs]:
         """Frames corrected with a depth and a motion, and the depth that the corrector used."""
-        # Simpler corrections know one camera's frame, and no depth from two of them.
+        # Simpler corrections use one camera's frame, without depth from two.
         options = replace(
             self.options, corrector=load_corrector(corrector), depth_from_motion=corrector == "fusion"
         )
@@ -316,7 +316,7 @@ class Bench:
         )
 
     def _layers(self, key: str) -> dict[View, Attempt]:
-        """The views of the cameras for which the corrector of layers found a scene."""
+        """The views of the cameras for which the corrector by layers found a scene."""
         corrector = load_corrector(key).component
         assert isinstance(corrector, LayersCorrector)
         corrector, problem, out = replace(corrector, seed=self._seed), self._problem(), dict[View, Attempt]()

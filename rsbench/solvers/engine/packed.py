@@ -1,26 +1,25 @@
-"""Correspondences as the compiled residuals want them, with normal or heavy-tailed errors, and samples of
+"""Correspondences in the form of the compiled residuals, with normal or heavy-tailed errors, and samples of
 tracks.
 
 Rays are normalised, and each measurement occurs once.
 
-Features found in noisy images err by some tenths of a pixel, and one in a hundred by more than a pixel. Under a
-t distribution of nu degrees of freedom and scale s a measurement of p residuals and squared error q has the
-weight
+Features of noisy images err by some tenths of a pixel, and one in a hundred by more than a pixel. Under a t
+distribution of nu degrees of freedom and scale s a measurement of p residuals and squared error q has the weight
 
     w = (nu + p) / (nu + q / s^2),
 
-so that an outlier counts for little, without a threshold. s and nu are those of the largest likelihood. K.
-Lange, R. Little, J. Taylor, Robust statistical modeling using the t distribution, JASA 1989.
+so that outliers have little weight, without a threshold. s and nu maximise the likelihood. K. Lange, R. Little, J.
+Taylor, Robust statistical modeling using the t distribution, JASA 1989.
 
-The weight cannot see a wrong match that bends the motion until its own residual vanishes. What shows it is its
-leverage, its share of the information of all measurements (6 in sum); a bounded leverage keeps the residual
-visible (Mallows weights; P. Huber, Robust Statistics, 1981, 7.2: leverages up to 0.2 are safe).
+The weight does not detect a wrong match that changes the motion until its own residual vanishes. Its leverage
+does, its share of the information of all measurements (6 in sum); with a bounded leverage the residual remains
+(Mallows weights; P. Huber, Robust Statistics, 1981, 7.2: leverages up to 0.2 are safe).
 
-Wrong matches that lie within ten scales by chance are no tail of that distribution: they would make it look
-heavier than it is, and pull. Errors are therefore a mixture of the t distribution and a uniform one over the ball
-of ten scales, whose share is estimated with them (EM: A. Dempster, N. Laird, D. Rubin, J. Royal Statistical
-Society B 1977; uniform outliers: P. Torr, A. Zisserman, MLESAC, 2000). A measurement counts by the probability
-that it is right.
+Wrong matches that lie within ten scales by chance are no tail of that distribution: they would bias its estimate
+and the motion. Errors are therefore a mixture of the t distribution and a uniform one over the ball of ten scales,
+whose share is estimated with them (EM: A. Dempster, N. Laird, D. Rubin, J. Royal Statistical Society B 1977;
+uniform outliers: P. Torr, A. Zisserman, MLESAC, 2000). A measurement is weighted by the probability that it is
+right.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # loads scipy.special with its first use: as long as all else that a solver needs
+import scipy  # loads scipy.special at its first use, which takes as long as loading all else that a solver needs
 from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
@@ -55,8 +54,8 @@ class Packed:
     tracks: FloatArray
     """(m, 8), see ``residuals.track_terms``, or (m, 4, 9), see ``residuals.timed_track_terms``."""
     row_checks: FloatArray
-    """(m,) squared row differences within the stereo pairs of the tracks: px^2, chi-squared with 2 degrees; 0 of
-    tracks (m, 4, 9), whose errors hold them."""
+    """(m,) squared row differences within the stereo pairs of the tracks: px^2, chi-squared with 2 degrees; 0 for
+    tracks (m, 4, 9), whose errors include them."""
     focal: FloatArray
     h: float
     baseline: float
@@ -67,7 +66,7 @@ class Packed:
 
     @property
     def law(self) -> MotionKernel:
-        """The kernel as the compiled residuals take it."""
+        """The kernel for the compiled residuals."""
         return quick_law(self.kernel)
 
     @property
@@ -120,7 +119,7 @@ class Packed:
     def at_once(self) -> Packed:
         """The ends of the right camera where it would have seen them when the left one did, to first order.
 
-        At no motion the others show no depth: what moves more than a disparity while lines are read spoils it.
+        At zero motion the original ends give no depth, if points move by more than a disparity in between.
         """
         tracks = self.tracks.copy()
         left, right = tracks[:, ::2], tracks[:, 1::2]
@@ -257,7 +256,7 @@ class Packed:
 
 
 def inverse_definite(H: FloatArray) -> FloatArray | None:
-    """Inverse of a positive definite matrix whose unknowns have different units; None when it is none."""
+    """Inverse of a positive definite matrix whose unknowns have different units; None if it is not definite."""
     scale = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     if not values[0] > 1e-12 * values[-1]:
@@ -423,15 +422,15 @@ def _each_track(
 
 
 _FEWEST = 30
-"""Measurements, five for each parameter: the scatter of fewer says little about their distribution."""
+"""Least number of measurements, five for each parameter: fewer do not determine their distribution."""
 _TAILS = (3.0, 5.0, 10.0, 30.0)
-"""Degrees of freedom to choose from: SIFT under photon noise has about 3; 30 is as good as normal."""
+"""Degrees of freedom to choose from: SIFT under photon noise has about 3; 30 is practically normal."""
 _REACH = 10.0
 """Errors, in scales, beyond which a match is wrong: its weight would be below 0.04."""
 _FIRST_NU, _MIXTURE_STEPS, _MOST_RIGHT = 3.0, 4, 0.999
-"""Tails to begin with; rounds of the mixture's EM; and the share of right ones within the reach, at most."""
+"""Initial degrees of freedom; rounds of the mixture's EM; largest share of right matches within the ten scales."""
 _SHIFT_STEP_PX = 1e-3
-"""Of numerical derivatives by the pixels of measurements."""
+"""Step of numerical derivatives by the pixels of measurements, px."""
 _EXACT_PX = 1e-7
 """Noise below which matches are exact."""
 _SAFE_LEVERAGE, _TIMES_THE_MEAN = 0.2, 3.0
@@ -511,15 +510,15 @@ class HeavyTailed(Packed):
         return trust * self.scale**2 * np.log1p(squares / (self.nu * self.scale**2))
 
     def noise_variance(self, cost: float) -> float:
-        """Variance of a coordinate, px^2, without tails: two in three errors are below its root."""
+        """Variance of a coordinate, px^2, without tails: two thirds of the errors are below its root."""
         return (self.scale * float(scipy.special.stdtrit(self.nu, _ONE_SIGMA))) ** 2
 
     def stated(self, theta: FloatArray, cost: float = 0.0, H: FloatArray | None = None) -> Stated | None:
-        """The covariance whatever the distribution of the errors, with what it was made from; None for none.
+        """The covariance for any distribution of the errors, with its ingredients; None if there is none.
 
-        See ``core.uncertainty``. The Hessian of the mixture is that of the t distribution less what is missing
-        because nobody knows which measurements are right (T. Louis, J. Royal Statistical Society B 1982). A track
-        is one measurement: errors that its keypoints share are counted together.
+        See ``core.uncertainty``. The Hessian of the mixture is that of the t distribution minus the information
+        that is lost because the right measurements are unknown (T. Louis, J. Royal Statistical Society B 1982). A
+        track is one measurement: errors that its keypoints share are counted together.
         """
         each, variance = each_term(self, theta), self.scale**2
         weights = self.weights(each.squares)
@@ -559,7 +558,7 @@ class HeavyTailed(Packed):
 
 
 def heavy_tailed(packed: Packed, theta: FloatArray, scale: float) -> HeavyTailed | None:
-    """The distribution that the errors of a motion near the right one show; None of fewer than 30 measurements.
+    """The distribution of the errors at a motion near the right one; None for fewer than 30 measurements.
 
     Args:
         scale: px, of the first guess: measurements beyond 10 of them are wrong.
@@ -584,7 +583,7 @@ def heavy_tailed(packed: Packed, theta: FloatArray, scale: float) -> HeavyTailed
 
 
 def _probability_right(q: FloatArray, p: FloatArray, nu: float, scale: float, share: float) -> FloatArray:
-    """(n,) that measurements within the reach are no wrong matches, of which there is a share besides.
+    """Probability (n,) that measurements within the ten scales are right, if there is a share of wrong ones.
 
     Args:
         share: of right ones among them.
@@ -604,7 +603,7 @@ def t_distribution(
     least: float = _LEAST_SCALE_PX,
     count: FloatArray | None = None,
 ) -> tuple[float, float]:
-    """nu and s of the largest likelihood.
+    """nu and s that maximise the likelihood.
 
     Args:
         squares: (n,) squared errors of measurements, px^2, of p (n,) residuals each.

@@ -1,4 +1,4 @@
-"""Motion from matches with outliers: any solver inside one and the same robust loop."""
+"""Motion from matches with outliers: one robust loop for all solvers."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from rsbench.solvers.engine.ransac import IntArray, RansacOptions, SearchOptions
 SIGMAS = 2.5
 """Standard deviations of the noise at which a match is an outlier."""
 _NEAR = 8.0
-"""Thresholds within which a solver that weighs matches itself is given them."""
+"""Thresholds within which matches are given to a solver that weights them itself."""
 _FIXED_POINT_STEPS = 8
 _GROUPS: tuple[MatchSet, ...] = ("left", "right", "tracks")
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatchCount:
-    """How many matches there were for the solver, and how many of them its motion explains."""
+    """Number of matches that the solver used, and of those that its motion explains."""
 
     inliers: int
     matches: int
@@ -48,8 +48,8 @@ class MatchCount:
 class RobustProblem:
     """The data are the left pairs, the right pairs, and the tracks that the solver uses as such.
 
-    Each measurement is in them once. To a solver that needs left-right matches, a track is a match over time with
-    a left-right match at both ends; it draws them together.
+    Each measurement is in them once. For a solver that needs left-right matches, a track is a match over time with
+    a left-right match at both ends; they are sampled together.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class RobustProblem:
         self.spec = solver.spec
         self._stereo = "stereo" in self.spec.needs
         self.reasons: Counter[str] = Counter()
-        """How often the solver failed on a sample for each reason."""
+        """Number of samples on which the solver failed, by reason."""
         self.sample_size, self.linked = self._plan(linked)
         self._affine = "affine" in self.spec.needs
         self._unlinked = {side: unlinked_pairs(correspondences, side) for side in SIDES}
@@ -74,7 +74,7 @@ class RobustProblem:
         self.packed = self._packed()
 
     def _plan(self, linked: bool) -> tuple[tuple[int, int, int], bool]:
-        """How many data of each group a sample takes, and whether tracks are used as such."""
+        """Number of data of each group in a sample, and whether tracks are used as such."""
         given = self.given
         if not self._stereo:
             pairs = Correspondences(left=given.left, right=given.right)
@@ -141,7 +141,7 @@ class RobustProblem:
 
     @property
     def shortage(self) -> str:
-        """What is missing for a minimal sample; empty when nothing is missing."""
+        """What is missing for a minimal sample; empty if nothing is."""
         names = dict(zip(_GROUPS, ("left matches", "right matches", "tracks"), strict=True))
         if self._affine:
             names["left"] = "left matches with affine frames"
@@ -156,7 +156,7 @@ class RobustProblem:
         return "; ".join(short)
 
     def failure(self, reason: str) -> str:
-        """Why there is no motion, with the most frequent reason that the solver gave for samples."""
+        """The reason of a failure, with the most frequent one that the solver returned for samples."""
         most_often = "".join(f"; most frequent failure: {text}" for text, _ in self.reasons.most_common(1))
         return f"{self.shortage or reason}{most_often}"
 
@@ -164,7 +164,7 @@ class RobustProblem:
         """Threshold at 2.5 standard deviations of the noise that the residuals below it show.
 
         A fixed point of: noise from the residuals below the threshold (a truncated distribution), threshold from
-        the noise. Outliers are spread too thinly to disturb it.
+        the noise. Outliers are too sparse to affect it.
         """
         squares = self.residuals(model) ** 2
         tracks = len(self.packed.tracks)
@@ -240,7 +240,7 @@ class RobustProblem:
         }
 
     def masks(self, inliers: BoolArray) -> dict[MatchSet, BoolArray]:
-        """Inliers over the sets as they were given: what a track repeats is one as the track is."""
+        """Inliers of the given sets: a match that a track repeats is one if the track is."""
         *pairs, tracks = np.split(inliers, np.cumsum(self.num_data)[:-1])
         out: dict[MatchSet, BoolArray] = {}
         as_pairs = np.ones(len(self.given.tracks), dtype=np.bool_)
@@ -287,12 +287,12 @@ def _moment(freedom: int) -> float:
 
 
 SECOND_TRY = 3.0
-"""Factor on the threshold when nothing was found."""
+"""Factor on the threshold after a search without result."""
 _ADAPTATIONS = 2
 _WORSE = 1.5
-"""Factor on the cost, at the adapted threshold, of what the search found (at least one datum's) beyond which the
-end is no improvement. On rendered frames closer inliers cost up to 1.3 times as much, and err less; refits of
-solvers that noise upsets cost 1.7 times as much and more."""
+"""Largest cost of the refined motion, at the adapted threshold, over that of the search's result (at least one
+datum's), which is else kept. On rendered frames more accurate motions cost up to 1.3 times as much; refits of
+solvers that are sensitive to noise cost 1.7 times as much and more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,19 +319,19 @@ class RobustEstimate:
 
     estimate: MotionEstimate
     inliers: dict[MatchSet, BoolArray] = field(default_factory=dict)
-    """Masks over ``left``, ``right`` and ``tracks``; all False after a failure. Sets may repeat the same points:
-    their sum counts those twice, ``counts`` does not."""
+    """Masks over ``left``, ``right`` and ``tracks``; all False after a failure. Points that sets repeat are
+    counted twice in their sum, but not in ``counts``."""
     counts: dict[MatchSet, MatchCount] = field(default_factory=dict)
     """Counts of matches that the solver uses, each once: ``tracks``, and under ``left`` and ``right`` the pairs
-    that no track repeats. For a solver of pairs a track is a left and a right pair, which count there."""
+    that no track repeats. For a solver of pairs a track is a left and a right pair."""
     iterations: int
     seconds: float
     threshold_px: float
-    """The threshold that the inliers have passed."""
+    """The threshold of the inliers."""
     reference_point: Literal["body", "left"] = "body"
     """The point of the rig whose translation the estimate gives: that of its solver's spec."""
     motion_model: str = ""
-    """The one that was chosen; empty: the one that the solver assumes."""
+    """The chosen motion model; empty: the one that the solver assumes."""
 
     @property
     def inlier_count(self) -> int:
@@ -340,7 +340,7 @@ class RobustEstimate:
 
     @property
     def match_count(self) -> int:
-        """Matches that the solver had to work on, each counted once."""
+        """Matches that the solver used, each counted once."""
         return sum(count.matches for count in self.counts.values())
 
 
@@ -356,14 +356,15 @@ def estimate_motion(
     """Robust motion from matches with outliers.
 
     A rolling-shutter solver's inliers have a small exact rolling-shutter Sampson error, a global-shutter one's a
-    small ordinary one (of the camera that it describes). A track's error counts all it says about the motion,
-    scaled so that one threshold rejects as many good tracks as good pairs. Too few matches or no consensus is a
-    failed estimate with the reason.
+    small ordinary one (of the camera that it describes). A track's error includes all its information on the
+    motion, scaled so that one threshold rejects as many right tracks as right pairs. Too few matches or no
+    consensus is a failed estimate with the reason.
 
-    A global-shutter solver is given the matches as an ideal rig would have them, unless it takes any rig. One that
-    does not take such cameras is a failure with the reason.
+    A global-shutter solver is given the matches as an ideal rig would have them, unless it supports any rig. A
+    solver that does not support the cameras gives a failure with the reason.
 
-    Left-right matches count as parts of tracks; where no tracks are given, those are joined (``join_stereo``).
+    Left-right matches are used as parts of tracks; if no tracks are given, they are joined to tracks
+    (``join_stereo``).
 
     Args:
         loop: ``own`` (``robust`` in a solver's card): the solver rejects outliers itself. It is given all
@@ -399,10 +400,10 @@ def estimate_motion(
 def inputs_of(
     spec: SolverSpec, matches: Correspondences, rig: StereoRig, shutter: RollingShutter
 ) -> tuple[Correspondences, StereoRig, RollingShutter]:
-    """What a solver is given of matches and cameras: see ``SolverSpec.cameras``.
+    """The matches and cameras that a solver is given: see ``SolverSpec.cameras``.
 
     Raises:
-        ValueError: it does not take such cameras, or one of them shows no ray at a match.
+        ValueError: it does not support the cameras, or the lens of one shows no ray at a match.
     """
     ideal = without_lens(matches, rig)
     if refusal := spec.refusal(rig, shutter):
@@ -476,7 +477,7 @@ class _Task(NamedTuple):
         problem, threshold = RobustProblem(*self[:4]), self.options.threshold_px
         yield problem, threshold
         if problem.linked and len(problem.packed.pairs) > len(problem.packed.tracks):
-            # Left-right matches that are mostly wrong: those over time may still be right.
+            # If left-right matches are mostly wrong, those over time may still be right.
             yield RobustProblem(*self[:4], linked=False), threshold
         if self.options.adapt_threshold and not problem.shortage:
             # Noise far above the threshold scatters the inliers of any model.
@@ -490,7 +491,8 @@ def _conclude(
     threshold: float,
     options: RobustOptions,
 ) -> tuple[MotionEstimate, BoolArray, float]:
-    """The solver on all matches near or on all inliers, those that this motion explains, and their threshold."""
+    """The solver's motion from all matches near or from all inliers, the matches that it explains, and their
+    threshold."""
     final = problem.weigh(model, threshold)
     if final is not None:
         if options.adapt_threshold:
@@ -507,7 +509,7 @@ def _conclude(
     if not knows_less and _cost(problem, final, threshold) > _WORSE * max(
         _cost(problem, found[0], threshold), 1.0
     ):
-        # A solver that more matches make worse: what the search found stands.
+        # The solver is worse with more matches: the result of the search is kept.
         return found
     return final, np.abs(problem.residuals(final)) <= threshold, threshold
 
