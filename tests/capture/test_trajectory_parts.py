@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy
 from scipy.spatial.transform import Rotation
-from shaken_rig import RIG, SHUTTER, matches, sines
+from shaken_rig import RATIO, RIG, SHUTTER, matches, sines
 
 from rsbench.capture.trajectory_fit import NORMAL, Fit, covariance_band, normal_equations, squared_errors
 from rsbench.capture.trajectory_spline import (
@@ -26,9 +26,17 @@ from rsbench.capture.trajectory_spline import (
     roughness,
     whitening,
 )
-from rsbench.capture.trajectory_tracks import ENOUGH, Tails, informative, noise_by_tile, pack_windows
+from rsbench.capture.trajectory_tracks import (
+    ENOUGH,
+    Tails,
+    TimedTracks,
+    informative,
+    noise_by_tile,
+    pack_windows,
+)
 from rsbench.components.motion_models import LinearMotion, motion_record, read_motion
 from rsbench.core.correspondences import Correspondences
+from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
 
 
@@ -106,6 +114,33 @@ def test_the_gradient_of_the_tracks_and_of_the_prior() -> None:
     wanted = differences(cost, curve, 1e-6)
     # Points are found to 1e-3 px of errors of some pixels, which they lower to first order only.
     np.testing.assert_allclose(ours, wanted, atol=2e-3 * np.max(np.abs(wanted)))
+
+
+def test_the_gradient_by_ratio_focal_length_and_principal_point() -> None:
+    rng = np.random.default_rng(11)
+    windows, _ = matches(sines(rng, 1.0, 0.15, 0.45), 3, rng, outliers=0.0, count=40)
+    pairs = [Correspondences(left=each.tracks[:, [0, 1, 4, 5]]) for each in windows]
+    curve = approximated(LinearMotion([0.02, -0.01, 0.01], [0.1, 0.0, -0.1]).body_from_world, (0.0, 2.8), 0.5)
+    prior, tails = Prior(0.5, 2, 1e-3, 1e-3), Tails(4.0, 2.0)
+
+    def tracks(ratio: float, log_focal: float, x: float, y: float) -> TimedTracks:
+        camera = RIG.camera
+        focal = {"fx": camera.fx * np.exp(log_focal), "fy": camera.fy * np.exp(log_focal)}
+        other = replace(camera, cx=camera.cx + x, cy=camera.cy + y, **focal)
+        return pack_windows(pairs, StereoRig.of_one(other), SHUTTER.with_ratio(ratio))
+
+    def cost(place: FloatArray) -> float:
+        each = tracks(*place)
+        return normal_equations(curve, each, tails, prior, np.ones(len(each)), False).cost
+
+    here, steps = np.array([RATIO, 0.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-2, 1e-2])
+    wanted = [(cost(here + step) - cost(here - step)) / (2.0 * np.max(step)) for step in steps]
+    ends = [tracks(ratio, 0.0, 0.0, 0.0).ends[:, [2, 7, 8]] for ratio in (0.0, 1.0)]
+    shared = replace(tracks(*here), by_ratio=ends[1] - ends[0])
+    border = normal_equations(curve, shared, tails, prior, np.ones(len(shared))).border
+    assert border is not None
+    # Weights of pixels change with the flow, which the last three derivatives ignore; errors are large here.
+    np.testing.assert_allclose(border.slope, wanted, rtol=0.02, atol=0.005 * np.max(np.abs(wanted)))
 
 
 @pytest.mark.parametrize("smooth", [1, 2])
