@@ -29,7 +29,7 @@ from rsbench.core import so3
 from rsbench.core.arguments import check_whole, keep_plain
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences, temporal_pairs
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import FEWEST_PER_PARAMETER
@@ -262,7 +262,13 @@ class RefinedSolver(Solver):
             packed = self.packed(together, rig, shutter)
             thetas = solve_triples(packed, np.arange(len(together.tracks)).reshape(-1, size))
             return (_finite(packed, [theta]) for theta in thetas)
-        return (self._propose_pairs(self.packed(sample, rig, shutter), rig) for sample in samples)
+        together = samples[0]
+        if len(samples) > 1:  # each has matches of one camera
+            left, right = (np.concatenate([getattr(sample, side) for sample in samples]) for side in SIDES)
+            together = Correspondences(left=left, right=right)
+        packed = self.packed(together, rig, shutter)
+        parts = np.split(packed.pairs, len(samples))
+        return (self._propose_pairs(replace(packed, pairs=each), rig) for each in parts)
 
     def _propose_pairs(self, packed: Packed, rig: StereoRig) -> list[MotionEstimate]:
         length = 0.5 * rig.baseline
