@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -108,7 +111,18 @@ def push(keeper: Path, change: Files) -> str:
 
 
 def judge(keeper: Path, head: str, *options: object, base: str = "main") -> subprocess.CompletedProcess[str]:
-    return run(sys.executable, "check.py", base, head, *options, cwd=keeper)
+    """Run check.py in this process, since importing rsbench takes longer than a judgement."""
+    words, output, errors, code = ["check.py", base, head, *map(str, options)], io.StringIO(), io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(output), redirect_stderr(errors):
+        patch.setattr(sys, "argv", words)
+        patch.chdir(keeper)
+        for name, value in (ME | {"PYTHONPATH": str(ROOT)}).items():
+            patch.setenv(name, value)
+        try:
+            runpy.run_path("check.py", run_name="__main__")
+        except SystemExit as stopped:
+            code = int(stopped.code or 0)
+    return subprocess.CompletedProcess(words, code, output.getvalue(), errors.getvalue())
 
 
 def assert_refused(ran: subprocess.CompletedProcess[str], words: str) -> None:
