@@ -40,8 +40,8 @@ if TYPE_CHECKING:  # what works on images is loaded where images are given, and 
     from rsbench.pipeline.mono_gyro import Clock
 
 BACKWARDS = (
-    "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to the "
-    "given one (`scan` in the rig's card)"
+    "time runs backwards in them: they are in the reverse order, or lines are read from the side opposite to the "
+    "given one (`scan` in the card)"
 )
 
 
@@ -137,14 +137,19 @@ def know_matches(
         models, errors = _calibrated(matches, rig, inputs, options)
         return matches, KnownCapture(rig=rig, shutter=inputs.shutter_of(rig), calibration=errors, models=models)
     capture = find_capture(matches, rig, inputs, options)
-    if inputs.scanning is not None and runs_backwards(capture, scans_of(rig.shutter_of(inputs.scanning, 1.0))):
-        raise RefusedFramesError(BACKWARDS)
+    refuse_backwards(capture, rig, inputs.scanning)
     shutter, errors = shutter_found(capture, rig), NO_ERRORS
     if rig.rows_together(shutter.scanning):
         if doubt is not None:
             raise doubt
         matches, errors = on_their_rows(matches, rig), capture.calibration
     return matches, KnownCapture(rig=rig, shutter=shutter, capture=capture, calibration=errors, models=capture)
+
+
+def refuse_backwards(capture: Capture, rig: StereoRig, scanning: Scanning | None) -> None:
+    """Raise RefusedFramesError if lines are clearly read from the side opposite to a given scanning."""
+    if scanning is not None and runs_backwards(capture, scans_of(rig.shutter_of(scanning, 1.0))):
+        raise RefusedFramesError(BACKWARDS)
 
 
 def _calibrated(

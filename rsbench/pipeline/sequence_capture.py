@@ -29,6 +29,7 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.camera_capture import IN_ORDER, PAIRS, find_focal, find_shutter
 from rsbench.pipeline.footage import FrameSource, OneCameraCard, Progress, RigCard, check_alike, no_progress
 from rsbench.pipeline.frame_capture import (
     KnownCapture,
@@ -41,7 +42,6 @@ from rsbench.pipeline.frame_capture import (
 )
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images
 from rsbench.pipeline.frame_motion import FoundMotion
-from rsbench.pipeline.mono_camera import IN_ORDER, PAIRS, find_camera_alone, find_shutter
 from rsbench.pipeline.mono_correction import FoundOwnMotion
 from rsbench.pipeline.mono_gyro import PAIRS as CLOCK_PAIRS
 from rsbench.pipeline.mono_gyro import pair_rates, with_clock_corrected
@@ -150,26 +150,19 @@ def _know_camera(
     robust, seed, pairs = options.robust, options.seed, max(frames.count - 1, 1)
     unknown = card.readout_ratio is None
     with progress("estimating the shutter", min(pairs, LONGEST if unknown else IN_ORDER) + unknown) as advance:
-        found = find_shutter(frames, frames.count, card, robust, seed, advance, starts)
+        known = find_shutter(frames, frames.count, card, robust, seed, advance, starts)
         if unknown:
             advance("all pairs together")
-    shutter = found.shutter
-    wanted, words = card.focal_unknown and found.focal is None, "estimating the focal length"
-    with progress(words, min(pairs, PAIRS)) if wanted else no_progress("", 0) as advance:
-        camera, focal = find_camera_alone(frames, frames.count, card, shutter, robust, seed, advance, found.focal)
+    if card.focal_unknown and known.focal is None:
+        with progress("estimating the focal length", min(pairs, PAIRS)) as advance:
+            known = find_focal(frames, frames.count, card, known, robust, seed, advance)
+    camera, shutter = known.rig.camera, known.shutter
     samples, clock = None if gyro is None else gyro.samples, None
     if gyro is not None and gyro.clock_error > 0.0:
         with progress("estimating the gyroscope's clock", min(pairs, CLOCK_PAIRS)) as advance:
             rates = pair_rates(frames, frames.count, camera, shutter, robust, seed, advance, starts)
         samples, clock = with_clock_corrected(rates, gyro.samples, camera, shutter, gyro.clock_error)
-    return KnownCapture(
-        rig=StereoRig.of_one(camera),
-        shutter=shutter,
-        capture=found.capture,
-        focal=focal,
-        gyro=samples,
-        clock=clock,
-    )
+    return replace(known, gyro=samples, clock=clock)
 
 
 # Windows of a sequence of a rig, and refusals of windows.

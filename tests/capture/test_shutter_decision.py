@@ -35,7 +35,6 @@ from rsbench.capture.shutter_decision import (
     known_alone,
     known_of,
     runs_backwards,
-    shutter_alone,
     shutter_found,
 )
 from rsbench.capture.two_frame_estimate import Candidate, Capture, conclude, examine, nearly_global
@@ -370,7 +369,7 @@ def test_a_turning_camera_shows_its_readout_whatever_the_unit_of_length() -> Non
     assert best is not None and best.scans.left == "top" and best.probability > 0.95
     # Its own deviation covers the error; 0.1 is what a correction asks for.
     assert abs(best.ratio - 0.7) < 3.0 * best.sigma and best.sigma < 0.1
-    assert shutter_alone(capture, CAMERA).readout_ratio == best.ratio
+    assert shutter_found(capture, StereoRig.of_one(CAMERA)).readout_ratio == best.ratio
 
 
 def test_exchanged_frames_look_read_from_the_other_side() -> None:
@@ -384,4 +383,4 @@ def test_exchanged_frames_look_read_from_the_other_side() -> None:
 def test_a_motion_along_the_lines_does_not_show_it() -> None:
     capture = _capture([_matches(LinearMotion(w=[0.0, 0.0, 0.0], d=[0.3, 0.0, 0.0]))])
     with pytest.raises(NoMotionError, match=r"cannot tell the readout ratio: the frames show .* read"):
-        shutter_alone(capture, CAMERA)
+        shutter_found(capture, StereoRig.of_one(CAMERA))

@@ -25,12 +25,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, View
 from rsbench.dataset.clock_channels import gyro_samples
 from rsbench.dataset.sequence import Sequence
-from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
-from rsbench.pipeline.frame_capture import find_matches
-from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs, frame_pairs, known_depth
-from rsbench.pipeline.frame_motion import FoundMotion, find_motion, model_to_use
-from rsbench.pipeline.layered_scene import LayersCorrector
-from rsbench.pipeline.one_camera import (
+from rsbench.pipeline.baseline_motions import (
     ZhuangCorrector,
     depth_alone,
     global_shutter_motion,
@@ -38,6 +33,11 @@ from rsbench.pipeline.one_camera import (
     monocular_motion,
     solved_alone,
 )
+from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
+from rsbench.pipeline.frame_capture import find_matches
+from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs, frame_pairs, known_depth
+from rsbench.pipeline.frame_motion import FoundMotion, find_motion, model_to_use
+from rsbench.pipeline.layered_scene import LayersCorrector
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.storage.files import sha256
 from rsbench.vision.correction import correction_flow

@@ -11,9 +11,9 @@ from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline import mono_camera as mono_shutter
+from rsbench.pipeline import camera_capture
+from rsbench.pipeline.camera_capture import find_shutter
 from rsbench.pipeline.footage import OneCameraCard
-from rsbench.pipeline.mono_camera import find_shutter
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
 CAMERA = PinholeCamera.centred(640, 480, 500.0)
@@ -30,7 +30,7 @@ def test_frames_are_reversed_where_each_pair_looks_so(
     options = SimulationOptions(pairs=200, noise_px=0.1)
     given = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences.left
     pairs = [(given if way == "f" else given[:, [2, 3, 0, 1]], "", CAMERA) for way in ways]
-    monkeypatch.setattr(mono_shutter, "matched_pairs", lambda *_: iter(pairs))
+    monkeypatch.setattr(camera_capture, "matched_pairs", lambda *_: iter(pairs))
     card = OneCameraCard(readout_ratio=0.7)
     if refused:
         with pytest.raises(RefusedFramesError, match="backwards"):
