@@ -6,8 +6,10 @@ corrected frames are then functions of frames, matches, this object and options.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,13 +27,14 @@ from rsbench.capture.rig_calibration import (
     rows_moved,
     with_errors,
 )
-from rsbench.capture.self_calibration import FoundFocal
+from rsbench.capture.self_calibration import FoundCamera, FoundFocal, find_camera
 from rsbench.capture.shutter_decision import as_global, known_of, runs_backwards, shutter_found
 from rsbench.capture.two_frame_estimate import Capture, conclude, examine
 from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.footage import Progress, no_progress
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.refined import RefinedSolver
 
@@ -411,3 +414,40 @@ def _check_enough(matches: Correspondences) -> Correspondences:
             "texture, or not the same scene"
         )
     return matches
+
+
+# The focal length and k1 of a rig whose card gives their standard deviations, from some of its frames.
+
+
+CAMERA_WINDOWS = 8
+"""Most windows, i.e. two successive frame times, for the focal length and k1."""
+
+
+def camera_of_frames(
+    windows: Iterable[Images], rig: StereoRig, options: CorrectionOptions, inputs: KnownInputs
+) -> FoundCamera:
+    """``find_camera`` from the matches of a few windows; windows without matches are skipped."""
+    matches = list[Correspondences]()
+    for images in islice(windows, CAMERA_WINDOWS):
+        with suppress(RefusedFramesError):  # the correction reports refused windows
+            matches.append(match_given(images, rig, options, inputs, judge_rig=False)[0])
+    if not matches:
+        return FoundCamera(rig=rig, sigma=inputs.sigma, determined=(False, False))
+    shutter = KnownInputs(readout_ratio=inputs.readout_ratio, scanning=inputs.scanning)
+    return find_camera(matches, rig, inputs.sigma, shutter, options.robust, options.seed)
+
+
+def with_found_camera(
+    rig: StereoRig,
+    windows: Iterable[Images],
+    options: CorrectionOptions,
+    inputs: KnownInputs,
+    progress: Progress = no_progress,
+) -> tuple[StereoRig, str]:
+    """The rig with focal length and k1 estimated if ``inputs.sigma`` is not 0, and a report on both."""
+    if not inputs.sigma:
+        return rig, ""
+    with progress("estimating the calibration", 1) as advance:
+        found = camera_of_frames(windows, rig, options, inputs)
+        advance("")
+    return found.rig, found.words(rig, inputs.sigma)

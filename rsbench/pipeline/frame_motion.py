@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, recalibrated
+from rsbench.capture.calibration import RefusedFramesError, recalibrated
 from rsbench.capture.hypotheses import MODELS, Known, scans_of
 from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model, spline_choice, spread_by_unknowns
 from rsbench.capture.rig_calibration import spread_of_motion
@@ -85,8 +85,6 @@ class FoundMotion:
     """Name of the solver's entry."""
     reference_point: str
     """The point whose translation ``robust.estimate.d`` is."""
-    calibration: tuple[float, ...] = NO_ERRORS
-    """Calibration errors that were removed from the matches, see ``calibration.TERMS``."""
     choice: ModelChoice | None = None
     """How the motion model was chosen; None if it is the solver's."""
     gyro: GyroFound | None = None
@@ -105,11 +103,6 @@ class FoundMotion:
         shifts = places - tau[:, None] * places[-1]
         turned, shifted = (float(np.sqrt(np.mean(np.sum(each**2, axis=1)))) for each in (turns, shifts))
         return turned, shifted
-
-    @property
-    def disparity_offset(self) -> float:
-        """Offset that was subtracted from the disparities, px."""
-        return self.calibration[OFFSET]
 
 
 def find_motion(
@@ -347,8 +340,8 @@ def solve_frames(
         RefusedFramesError: the frames are in reverse order.
         NoMotionError: no motion explains the matches.
     """
-    rig, shutter, errors = known.rig, known.shutter, known.calibration
-    corrected = recalibrated(matches, rig, errors)
+    rig, shutter = known.rig, known.shutter
+    corrected = recalibrated(matches, rig, known.calibration)
     found = find_motion(corrected, rig, shutter, options, compared=known.models)
     if known.capture is None and not in_order and _runs_backwards(corrected, rig, found, shutter, options):
         raise RefusedFramesError(BACKWARDS)
@@ -361,7 +354,7 @@ def solve_frames(
         noise = estimate.noise_px or 0.0
         spread = spread_of_motion(known.rig_found, corrected, estimate.w, estimate.d, noise, model)
         found = replace(found, robust=widened(found.robust, spread))
-    return replace(found, calibration=errors)
+    return found
 
 
 def _runs_backwards(

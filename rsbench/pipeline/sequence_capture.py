@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import NO_ERRORS, CardSigma, RefusedFramesError, check_rig
+from rsbench.capture.calibration import NO_ERRORS, RefusedFramesError, check_rig
 from rsbench.capture.hypotheses import GLOBAL, Known, KnownInputs
 from rsbench.capture.rig_calibration import FoundRig
-from rsbench.capture.self_calibration import FoundCamera, find_camera
 from rsbench.capture.sequence_shutter import LONGEST, SUCCESSIVE, capture_of_sequence, shakes
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_tracks import ENOUGH
@@ -32,6 +30,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.camera_capture import IN_ORDER, PAIRS, find_focal, find_shutter
 from rsbench.pipeline.footage import FrameSource, OneCameraCard, Progress, RigCard, check_alike, no_progress
 from rsbench.pipeline.frame_capture import (
+    CAMERA_WINDOWS,
     KnownCapture,
     compared_models,
     find_rig,
@@ -39,6 +38,7 @@ from rsbench.pipeline.frame_capture import (
     match_given,
     rig_of_matches,
     with_enough,
+    with_found_camera,
 )
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images
 from rsbench.pipeline.frame_motion import FoundMotion
@@ -107,7 +107,7 @@ def know_capture(
         return _know_camera(sources[0], card, options, gyro, progress)
     left, right = sources
     rig, inputs, shown = card.rig_of(next(iter(left)), next(iter(right))), card.inputs, spread_windows(left, right)
-    rig, note = with_found_camera(rig, card.sigma, shown, options, inputs, progress)
+    rig, note = with_found_camera(rig, shown, options, inputs, progress)
     turned = with_found_rig(rig, left, right, options, inputs)
     rig = rig if turned is None else turned.rig
     if not rig.aligned:  # its calibration errors are estimated by ``refine_rig``
@@ -366,48 +366,13 @@ def _narrowed(known: Known, capture: Capture) -> Known:
     return replace(known, scans=tuple(each for each in known.scans if each in left))
 
 
-# The focal length and k1 of a rig whose card gives their standard deviations, from some of its frames.
-
-
-_WINDOWS = 8
-"""Most windows for the focal length and k1."""
+# Estimates of a rig's calibration from some frames of a sequence.
 
 
 def spread_windows(left: FrameSource, right: FrameSource) -> Iterable[Images]:
     """Evenly spaced windows of a sequence."""
-    every = max((left.count - 1) // _WINDOWS, 1)
+    every = max((left.count - 1) // CAMERA_WINDOWS, 1)
     return islice(window_images(left, right), every // 2, None, every)
-
-
-def camera_of_frames(
-    windows: Iterable[Images], rig: StereoRig, sigma: CardSigma, options: CorrectionOptions, inputs: KnownInputs
-) -> FoundCamera:
-    """``find_camera`` from the matches of a few windows; windows without matches are skipped."""
-    matches = list[Correspondences]()
-    for images in islice(windows, _WINDOWS):
-        with suppress(RefusedFramesError):  # the correction reports refused windows
-            matches.append(match_given(images, rig, options, inputs, judge_rig=False)[0])
-    if not matches:
-        return FoundCamera(rig=rig, sigma=sigma, determined=(False, False))
-    shutter = KnownInputs(readout_ratio=inputs.readout_ratio, scanning=inputs.scanning)
-    return find_camera(matches, rig, sigma, shutter, options.robust, options.seed)
-
-
-def with_found_camera(
-    rig: StereoRig,
-    sigma: CardSigma,
-    windows: Iterable[Images],
-    options: CorrectionOptions,
-    inputs: KnownInputs,
-    progress: Progress = no_progress,
-) -> tuple[StereoRig, str]:
-    """The rig with focal length and k1 estimated if their ``sigma`` is not 0, and a report on both."""
-    if not sigma:
-        return rig, ""
-    with progress("estimating the calibration", 1) as advance:
-        found = camera_of_frames(windows, rig, sigma, options, inputs)
-        advance("")
-    return found.rig, found.words(rig, sigma)
 
 
 def with_found_rig(

@@ -16,6 +16,7 @@ from rsbench.benchmark.images.predict import true_pairs
 from rsbench.benchmark.images.store import identity_of
 from rsbench.benchmark.provenance import numeric_version
 from rsbench.benchmark.scoring import motion_errors
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.imports import hash_of_files
 from rsbench.components.seeds import generator
@@ -279,8 +280,8 @@ class Bench:
             self.options, corrector=load_corrector(corrector), depth_from_motion=corrector == "fusion"
         )
         given = Given(matches=self.matches, motion=motion, pairs=pairs)
-        ratio = self.shutter.readout_ratio
-        result = correct_four(self.images, self.rig, ratio, options, given=given, views=views)
+        inputs = KnownInputs.of(self.shutter)
+        result = correct_four(self.images, self.rig, inputs, options, given=given, views=views)
         return result.frames, result.pairs or pairs
 
     def _nothing(self) -> dict[View, Attempt]:
