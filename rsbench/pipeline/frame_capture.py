@@ -130,7 +130,7 @@ def know_matches(
     Args:
         inputs: calibration errors that are not given are estimated if row differences of the matches show some; a
             scanning that is not given is estimated with the readout ratio, or rows from the top.
-        doubt: error that is raised if both cameras read rows at the same time, see ``match_unknown``.
+        doubt: error that is raised if both cameras read rows at the same time, see ``match_given``.
 
     Raises:
         RefusedFramesError: the frames are in reverse order.
@@ -367,14 +367,12 @@ def _refined_rig(
     return refine_rig([matches], rig, shutter, start, prior, options.robust, options.seed, _model_name(options))
 
 
-def match_unknown(
-    images: Images, rig: StereoRig, options: CorrectionOptions, *, judge_rig: bool = True
+def match_given(
+    images: Images, rig: StereoRig, options: CorrectionOptions, inputs: KnownInputs, *, judge_rig: bool = True
 ) -> tuple[Correspondences, RefusedFramesError | None]:
-    """``match_frames`` for an unknown scan; also the error to raise if both cameras read rows at the same time.
-
-    Raises:
-        RefusedFramesError: the frames have no texture.
-    """
+    """``match_frames``; for an unknown scan also the error to raise if both cameras read rows at the same time."""
+    if inputs.readout_ratio is not None or inputs.scanning is not None:
+        return match_frames(images, rig, options, inputs.scanning, judge_rig=judge_rig), None
     doubt = None
     try:
         if judge_rig:
@@ -383,15 +381,6 @@ def match_unknown(
         doubt = error
     scanning = Scanning() if options.features.component.apart() is None else Scanning(scan="left")
     return _check_enough(find_matches_of_rig(images, rig, scanning, options)), doubt
-
-
-def match_given(
-    images: Images, rig: StereoRig, options: CorrectionOptions, inputs: KnownInputs, *, judge_rig: bool = True
-) -> tuple[Correspondences, RefusedFramesError | None]:
-    """``match_frames`` if readout ratio or scanning are given, otherwise ``match_unknown``; raises as these do."""
-    if inputs.readout_ratio is None and inputs.scanning is None:
-        return match_unknown(images, rig, options, judge_rig=judge_rig)
-    return match_frames(images, rig, options, inputs.scanning, judge_rig=judge_rig), None
 
 
 def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:

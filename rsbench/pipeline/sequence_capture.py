@@ -36,6 +36,7 @@ from rsbench.pipeline.frame_capture import (
     find_rig,
     match_frames,
     match_given,
+    refuse_backwards,
     rig_of_matches,
     with_enough,
     with_found_camera,
@@ -241,7 +242,7 @@ def estimate_sequence_capture(
         advance: called after each window.
 
     Raises:
-        RefusedFramesError: the first windows contradict the given rig.
+        RefusedFramesError: the first windows contradict the given rig, or the frames are in reverse order.
         NoMotionError: the windows do not determine the shutter.
     """
     inputs = inputs or KnownInputs()
@@ -276,6 +277,7 @@ def estimate_sequence_capture(
     capture = None if estimate.nothing_unknown else estimate.concluded()
     if capture is None or inputs.readout_ratio is not None:
         return capture, inputs.shutter_of(rig)
+    refuse_backwards(capture, rig, inputs.scanning)
     shutter, doubt = shutter_found(capture, rig), next(filter(None, doubts), None)
     if doubt is not None and rig.rows_together(shutter.scanning):
         raise doubt
