@@ -216,7 +216,7 @@ def score(given: argparse.Namespace) -> list[str]:
         try:
             inputs = KnownInputs(readout_ratio=ratio, calibration=calibration)
             matches = match_frames(images, rig, options)
-            motion = solve_frames(*know_matches(matches, rig, inputs, options), options)
+            motion = solve_frames(know_matches(matches, rig, inputs, options), options)
         except RsbenchError as error:
             refused += 1
             lines.append(f"{k:4d}  {error}")

@@ -71,7 +71,7 @@ class CorrectedFrames:
     at_rows: list[dict[View, Fused]]
     """The frames corrected to each of the further target rows."""
     seconds: dict[str, float]
-    """Duration of each of ``STEPS``."""
+    """Duration of each of ``STEPS``; matching includes the estimate of the capture."""
 
     @property
     def rig(self) -> StereoRig:
@@ -119,15 +119,16 @@ def correct_four(
     if given.motion is not None and inputs.readout_ratio is None:
         raise ValueError("readout_ratio must be given with the motion: one estimated from matches may not fit it")
     clock, needs = _Clock(step), options.corrector.component.spec.needs
-    wanted, matches = given.motion is None and "motion" in needs, given.matches
+    wanted = given.motion is None and "motion" in needs
     rig, note = with_found_camera(rig, [images], options, inputs)
-    if inputs.readout_ratio is not None and not wanted and (matches is not None or "matches" not in needs):
-        known = KnownCapture(rig=rig, shutter=inputs.shutter_of(rig), calibration=errors)
-        clock("matching")
+    if inputs.readout_ratio is not None and not wanted and (given.matches or "matches" not in needs):
+        shutter = inputs.shutter_of(rig)
+        known = KnownCapture(rig=rig, shutter=shutter, matches=given.matches, calibration=errors)
     else:
-        matches, known = know_four(images, rig, inputs, options, matches, clock)
+        known = know_four(images, rig, inputs, options, given.matches)
     known = replace(known, camera_note=note)
-    found = solve_frames(matches, known, options) if wanted and matches is not None else None
+    clock("matching")
+    found = solve_frames(known, options) if wanted else None
     clock("motion")
     rig, shutter, offset = known.rig, known.shutter, known.calibration[OFFSET]
     if known.capture is not None:
@@ -137,7 +138,7 @@ def correct_four(
         find_depth(images, rig, shutter, motion, options, given.pairs, offset) if "depth" in needs else given.pairs
     )
     clock("depth")
-    given = replace(given, matches=matches, motion=motion, pairs=pairs)
+    given = replace(given, matches=known.matches, motion=motion, pairs=pairs)
     frames, *at_rows = correct_known_rows(
         images, given, rig, shutter, options, views, offset, (options.target_row, *rows)
     )
@@ -146,7 +147,7 @@ def correct_four(
         motion=motion,
         found=found,
         known=known,
-        matches=matches,
+        matches=known.matches,
         pairs=pairs,
         frames=frames,
         at_rows=at_rows,

@@ -1,12 +1,12 @@
 """Estimate the capture of four frames of a rig: find or refuse matches, then estimate what is not given.
 
-``know_four`` and ``know_matches`` return a ``KnownCapture`` (rig, shutter, calibration errors). Motion, depth and
-corrected frames are then functions of frames, matches, this object and options.
+``know_four`` and ``know_matches`` return a ``KnownCapture`` (rig, shutter, calibration errors, matches). Motion,
+depth and corrected frames are then functions of frames, this object and options.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -16,7 +16,7 @@ import numpy as np
 
 from rsbench.capture.calibration import NO_ERRORS, RefusedFramesError, check_rig
 from rsbench.capture.hypotheses import MODELS, KnownInputs, scans_of
-from rsbench.capture.model_choice import AUTO
+from rsbench.capture.model_choice import compared_models
 from rsbench.capture.rig_calibration import (
     ERRORS,
     FoundRig,
@@ -55,6 +55,8 @@ class KnownCapture:
     rig: StereoRig
     """The cameras; for one camera ``StereoRig.of_one``."""
     shutter: RollingShutter
+    matches: Correspondences | None = None
+    """The matches of two frame times that are valid for the shutter; None for a sequence."""
     capture: Capture | None = None
     """The estimate of the shutter; None if it is given."""
     calibration: tuple[float, ...] = NO_ERRORS
@@ -79,14 +81,12 @@ def know_four(
     inputs: KnownInputs,
     options: CorrectionOptions,
     matches: Correspondences | None = None,
-    step: Callable[[str], None] = lambda word: None,
-) -> tuple[Correspondences, KnownCapture]:
+) -> KnownCapture:
     """Match four frames and estimate their capture, for ``solve_frames``.
 
     Args:
         inputs: given values; calibration errors of a rig that is not aligned are estimated by ``refine_rig``.
         matches: given matches, which are used unchanged; None: the frames are matched.
-        step: called with ``matching`` when there are matches.
 
     Raises:
         RefusedFramesError, NoMotionError: see ``match_frames`` and ``know_matches``.
@@ -94,11 +94,10 @@ def know_four(
 
     def known(
         matches: Correspondences, found: FoundRig | None, doubt: RefusedFramesError | None = None
-    ) -> tuple[Correspondences, KnownCapture]:
+    ) -> KnownCapture:
         right = rig if found is None else found.rig
         given = inputs if right.aligned else replace(inputs, calibration=inputs.calibration or NO_ERRORS)
-        matches, capture = know_matches(matches, right, given, options, doubt)
-        return matches, replace(capture, rig_found=found)
+        return replace(know_matches(matches, right, given, options, doubt), rig_found=found)
 
     from rsbench.vision.dense_matcher import forget_matches
 
@@ -107,7 +106,6 @@ def know_four(
     try:
         if matches is None:
             matches, doubt = match_given(images, rig, options, inputs)
-        step("matching")
         if check and doubt is None and not rig.aligned and inputs.calibration is None:
             found = rig_of_matches(matches, rig, inputs, options)
         return known(matches, found, doubt)
@@ -124,8 +122,8 @@ def know_matches(
     inputs: KnownInputs,
     options: CorrectionOptions,
     doubt: RefusedFramesError | None = None,
-) -> tuple[Correspondences, KnownCapture]:
-    """Estimate the capture from matches; returns the matches that are valid for it, and the capture.
+) -> KnownCapture:
+    """Estimate the capture from matches.
 
     Args:
         inputs: calibration errors that are not given are estimated if row differences of the matches show some; a
@@ -138,7 +136,8 @@ def know_matches(
     """
     if inputs.readout_ratio is not None:
         models, errors = _calibrated(matches, rig, inputs, options)
-        return matches, KnownCapture(rig=rig, shutter=inputs.shutter_of(rig), calibration=errors, models=models)
+        shutter = inputs.shutter_of(rig)
+        return KnownCapture(rig=rig, shutter=shutter, matches=matches, calibration=errors, models=models)
     capture = find_capture(matches, rig, inputs, options)
     refuse_backwards(capture, rig, inputs.scanning)
     shutter, errors = shutter_found(capture, rig), NO_ERRORS
@@ -146,7 +145,9 @@ def know_matches(
         if doubt is not None:
             raise doubt
         matches, errors = on_their_rows(matches, rig), capture.calibration
-    return matches, KnownCapture(rig=rig, shutter=shutter, capture=capture, calibration=errors, models=capture)
+    return KnownCapture(
+        rig=rig, shutter=shutter, matches=matches, capture=capture, calibration=errors, models=capture
+    )
 
 
 def refuse_backwards(capture: Capture, rig: StereoRig, scanning: Scanning | None) -> None:
@@ -185,11 +186,6 @@ def capture_of(
     known = known_of(matches, rig, inputs)
     capture = conclude([examine(matches, rig, known, robust, seed)])
     return as_global(capture, [matches], rig, known) if inputs.readout_ratio is None else capture
-
-
-def compared_models(motion_model: str | None) -> tuple[str, ...]:
-    """The motion models to compare: all for ``auto`` or None, otherwise the requested one."""
-    return MODELS if motion_model in (None, AUTO) else (str(motion_model),)
 
 
 # Matches of the frames of a rig, and the correction of its calibration by them.
@@ -362,7 +358,7 @@ def _refined_rig(
 ) -> FoundRig | None:
     """``refine_rig`` with the given shutter, or with the one estimated for the rig with the errors ``start``."""
     inputs = replace(inputs, calibration=NO_ERRORS)
-    shutter = know_matches(matches, with_errors(rig, start), inputs, options)[1].shutter
+    shutter = know_matches(matches, with_errors(rig, start), inputs, options).shutter
     prior = prior_of(start)
     return refine_rig([matches], rig, shutter, start, prior, options.robust, options.seed, _model_name(options))
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rsbench.capture.calibration import NO_ERRORS, RefusedFramesError, check_rig
 from rsbench.capture.hypotheses import GLOBAL, Known, KnownInputs
+from rsbench.capture.model_choice import compared_models
 from rsbench.capture.rig_calibration import FoundRig
 from rsbench.capture.sequence_shutter import LONGEST, SUCCESSIVE, capture_of_sequence, shakes
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
@@ -32,7 +33,6 @@ from rsbench.pipeline.footage import FrameSource, OneCameraCard, Progress, RigCa
 from rsbench.pipeline.frame_capture import (
     CAMERA_WINDOWS,
     KnownCapture,
-    compared_models,
     find_rig,
     match_frames,
     match_given,

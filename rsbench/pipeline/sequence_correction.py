@@ -207,7 +207,7 @@ def _windows(
                 judged = number < JUDGED
                 matches = match_frames(images, known.rig, matching, known.shutter.scanning, judge_rig=judged)
                 if "motion" in needs and with_motion:
-                    found = solve_frames(matches, known, options, in_order=True)
+                    found = solve_frames(replace(known, matches=matches), options, in_order=True)
             except NoMotionError as error:
                 reason = str(error)
             except RefusedFramesError as error:

@@ -167,7 +167,7 @@ def test_frames_in_the_wrong_order_are_noticed() -> None:
         with pytest.raises(RefusedFramesError, match="backwards"):
             options = CorrectionOptions(motion_model=AUTO)
             inputs = KnownInputs(readout_ratio=ratio, scanning=TOP)
-            solve_frames(*know_matches(turned, RIG, inputs, options), options)
+            solve_frames(know_matches(turned, RIG, inputs, options), options)
 
 
 def test_a_disparity_offset_is_found_with_the_ratio() -> None:
@@ -208,7 +208,7 @@ def matches_of(model: str, seed: int = 0) -> Correspondences:
 def test_each_model_is_recognised_and_gives_the_right_d(model: str) -> None:
     """Among outliers; chi-squared with 6 degrees of freedom: beyond 22.5 in one of a thousand."""
     options = CorrectionOptions(motion_model=AUTO)
-    solved = solve_frames(*know_matches(matches_of(model), RIG, AT_TOP, options), options, in_order=True)
+    solved = solve_frames(know_matches(matches_of(model), RIG, AT_TOP, options), options, in_order=True)
     assert solved.choice is not None
     choice, found = solved.choice, solved.robust.estimate
     assert choice.used == model and sum(choice.probability.values()) == pytest.approx(1.0)
@@ -217,7 +217,7 @@ def test_each_model_is_recognised_and_gives_the_right_d(model: str) -> None:
     assert error @ np.linalg.solve(_known(found.covariance), error) < 22.5
     if model != "linear":
         options = CorrectionOptions()
-        linear = solve_frames(*know_matches(matches_of(model), RIG, AT_TOP, options), options, in_order=True)
+        linear = solve_frames(know_matches(matches_of(model), RIG, AT_TOP, options), options, in_order=True)
         assert np.linalg.norm(linear.motion.d - D) > 1.5 * np.sqrt(np.trace(_known(found.covariance)[3:, 3:]))
 
 

@@ -276,8 +276,7 @@ def test_matches_without_a_motion_say_why(castle: Sequence) -> None:
     rng = np.random.default_rng(0)
     noise = Correspondences(left=rng.uniform(0, 90, (8, 4)), right=rng.uniform(0, 90, (8, 4)))
     with pytest.raises(NoMotionError, match="found no motion: "):
-        known = KnownCapture(rig=castle.rig, shutter=castle.shutter)
-        solve_frames(noise, known, CorrectionOptions())
+        solve_frames(KnownCapture(rig=castle.rig, shutter=castle.shutter, matches=noise), CorrectionOptions())
 
 
 def test_sixteen_bits_use_one_factor_for_all() -> None:
