@@ -77,13 +77,15 @@ class NoMotionError(RsbenchError):
 def known_of(matches: Correspondences, rig: StereoRig, given: KnownInputs) -> Known:
     """Convert given values to what is known about a capture before its matches are fitted.
 
-    If no calibration errors are given, they are estimated where the row differences of left-right matches show
-    some; the size of these differences sets their prior.
+    With a readout ratio and no scanning, rows are read from the top. If no calibration errors are given, they are
+    estimated where the row differences of left-right matches show some; the size of these differences sets their
+    prior.
 
     Raises:
         RsbenchError: a readout ratio of the right camera is given, but none of the left one.
     """
-    ratio, scanning, scans = given.readout_ratio, given.scanning, ALL_SCANS
+    ratio, scans = given.readout_ratio, ALL_SCANS
+    scanning = given.scanning if ratio is None else given.reading
     if scanning is not None:
         if ratio is None and scanning.right_readout_ratio is not None:
             raise RsbenchError(

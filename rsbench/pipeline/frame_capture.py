@@ -162,7 +162,6 @@ def _calibrated(
     """Estimate calibration errors with a known shutter, if the matches show some; None: no estimate was made."""
     if inputs.calibration is not None or not rig.rows_together(inputs.reading):
         return None, inputs.calibration or NO_ERRORS
-    inputs = replace(inputs, scanning=inputs.reading)
     if not any(known_of(matches, rig, inputs).calibration_sigma):
         return None, NO_ERRORS
     capture = find_capture(matches, rig, inputs, options)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -246,8 +247,6 @@ def estimate_sequence_capture(
         NoMotionError: the windows do not determine the shutter.
     """
     inputs = inputs or KnownInputs()
-    if inputs.readout_ratio is not None:
-        inputs = replace(inputs, scanning=inputs.reading)
 
     def under_global() -> Capture | None:
         still = replace(inputs, readout_ratio=0.0, scanning=Scanning())
@@ -381,9 +380,8 @@ def with_found_rig(
     rig: StereoRig, left: FrameSource, right: FrameSource, options: CorrectionOptions, inputs: KnownInputs
 ) -> FoundRig | None:
     """Correct the rig's calibration by the first frames; None if their rows agree with it or are inconclusive."""
-    images = next(iter(window_images(left, right)), None)
-    together = rig.rows_together(inputs.reading, inputs.readout_ratio)
-    if images is None or (rig.aligned and not together):
+    images, together = next(window_images(left, right)), rig.rows_together(inputs.reading, inputs.readout_ratio)
+    if rig.aligned and not together:
         return None
     inputs = replace(inputs, calibration=None)
     try:
@@ -392,9 +390,6 @@ def with_found_rig(
             return None
         return rig_of_matches(match_frames(images, rig, options, inputs.scanning), rig, inputs, options)
     except RefusedFramesError as refusal:
-        if not together:
-            return None  # the correction reports refused windows
-        try:
-            return find_rig(images, rig, inputs, options, refusal)[0]
-        except (RefusedFramesError, NoMotionError):
-            return None  # the correction reports refused windows
+        with suppress(RefusedFramesError, NoMotionError):  # the correction reports refused windows
+            return find_rig(images, rig, inputs, options, refusal)[0] if together else None
+        return None
