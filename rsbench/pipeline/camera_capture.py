@@ -1,4 +1,4 @@
-"""The estimate of what the card of a camera whose frames are corrected alone does not give."""
+"""Estimate the capture of one camera's frames: shutter and focal length, if its card does not give them."""
 
 from __future__ import annotations
 
