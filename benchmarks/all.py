@@ -158,7 +158,7 @@ def asked_over_matched(data: Path) -> tuple[Work, Work]:
     from rsbench.capture.shutter_decision import known_of
     from rsbench.capture.two_frame_estimate import conclude, examine
     from rsbench.dataset.sequence import read_dataset
-    from rsbench.pipeline.frame_capture import match_unknown
+    from rsbench.pipeline.frame_capture import match_given
     from rsbench.pipeline.frame_depth import CorrectionOptions
     from rsbench.vision.dense_matcher import forget_matches
 
@@ -167,7 +167,7 @@ def asked_over_matched(data: Path) -> tuple[Work, Work]:
 
     def match() -> Correspondences:
         forget_matches()
-        return match_unknown(images, sequence.rig, options)[0]
+        return match_given(images, sequence.rig, options, KnownInputs())[0]
 
     def inspect() -> None:
         matches = match()

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.card import CameraCard, DatasetCard, MotionCard, SequenceCard
 from rsbench.dataset.generation import generate_dataset
@@ -61,8 +62,7 @@ def card(name: str) -> DatasetCard:
 def row(folder: Path) -> str:
     (sequence,) = read_dataset(folder)
     images, twins = ({view: sequence.image(kind, *view) for view in VIEWS} for kind in ("rs", "gs"))
-    ratio, scanning = sequence.shutter.readout_ratio, sequence.shutter.scanning
-    found = correct_four(images, sequence.rig, ratio, CorrectionOptions(), scanning=scanning)
+    found = correct_four(images, sequence.rig, KnownInputs.of(sequence.shutter), CorrectionOptions())
     before, after = (
         np.mean([psnr(each[view], twins[view]) for view in VIEWS])
         for each in (images, {view: found.frames[view].image for view in VIEWS})

@@ -56,9 +56,9 @@ STEPS = (
     ("depth", "rsbench.pipeline.sequence_correction", "frame_pair"),
     ("depth of motion", "rsbench.pipeline.sequence_correction", "find_depth"),
     ("correct", "rsbench.pipeline.sequence_correction", "correct_known_rows"),
-    ("look and motion", "rsbench.pipeline.mono_sequence", "_seen"),
+    ("look and motion", "rsbench.pipeline.mono_sequence", "_analyse"),
     ("motion and depth", "rsbench.pipeline.mono_sequence", "_ready"),
-    ("draw", "rsbench.pipeline.mono_sequence", "_moment"),
+    ("draw", "rsbench.pipeline.mono_sequence", "_corrected"),
 )
 """Of videos, by the functions that do them; one camera's begin at the fifth."""
 

@@ -53,7 +53,7 @@ def run(sequence: Sequence, options: CorrectionOptions) -> dict[str, tuple[float
     matches = timed("match", lambda: match_frames(images, rig, options))
     ratio = sequence.shutter.readout_ratio
     inputs, shutter = KnownInputs(readout_ratio=ratio), sequence.shutter
-    found = timed("solve", lambda: solve_frames(*know_matches(matches, rig, inputs, options), options))
+    found = timed("solve", lambda: solve_frames(know_matches(matches, rig, inputs, options), options))
     pairs = timed("depth", lambda: find_depth(images, rig, shutter, found.motion, options))
     timed("correct", lambda: correct_frames(images, pairs, rig, shutter, found.motion, options))
     return times

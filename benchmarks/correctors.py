@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.studies.correction_bench import METHODS, ON_REQUEST
 from rsbench.benchmark.studies.correction_study import study_dataset
-from rsbench.capture.calibration import CardSigma
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.core.rig import VIEWS, View
 from rsbench.dataset import sequence as recorded
 from rsbench.dataset.card import load_dataset_card
@@ -81,7 +81,7 @@ def edge_rows(sequence: recorded.Sequence) -> list[dict[str, object]]:
     alone = MonoFusionCorrector().correct(problem, VIEWS)
     methods: dict[str, Mapping[View, Fused]] = {
         "uncorrected": uncorrected(images),
-        "fusion": of_rig(frames, known[0], known[1].readout_ratio, options, sigma=CardSigma(), close=True).frames,
+        "fusion": of_rig(frames, known[0], KnownInputs.of(known[1]), options, close=True).frames,
         "mono-fusion": {view: finished(fused) for view, fused in alone.items()},
     }
     rows = []

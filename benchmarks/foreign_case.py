@@ -19,6 +19,7 @@ from foreign_world import Image, read_photographs
 from numpy.typing import NDArray
 
 import rsbench
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.motion import Motion
@@ -93,7 +94,7 @@ def truth_fed(
     seen = dict(zip(views, images, strict=True))
     given = Given(motion=motion, pairs=known_depth(seen, dict(zip(views, depth, strict=True))))
     options = CorrectionOptions(depth_from_motion=False)
-    return correct_four(seen, rig, shutter.readout_ratio, options, given=given, scanning=shutter.scanning).frames
+    return correct_four(seen, rig, KnownInputs.of(shutter), options, given=given).frames
 
 
 @cache

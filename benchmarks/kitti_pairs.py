@@ -23,7 +23,7 @@ from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of,
 from rsbench.capture.two_frame_estimate import CERTAIN, conclude, examine
 from rsbench.core.errors import RsbenchError
 from rsbench.pipeline.footage import FrameSource
-from rsbench.pipeline.frame_capture import match_unknown
+from rsbench.pipeline.frame_capture import match_given
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.sequence_capture import window_images
 
@@ -38,7 +38,7 @@ def stated(folder: Path, names: tuple[str, str], every: int) -> Iterator[tuple[i
     for number, images in enumerate(window_images(*sources)):
         if number % every:
             continue
-        matches = match_unknown(images, rig, options)[0]
+        matches = match_given(images, rig, options, KnownInputs())[0]
         known = known_of(matches, rig, KnownInputs())
         found = conclude([examine(matches, rig, known, options.robust, 0)])
         capture = as_global(found, [matches], rig, known)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import CardSigma
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.core.errors import RsbenchError
 from rsbench.dataset.layout import moving_file
 from rsbench.dataset.sequence import Sequence, read_dataset
@@ -37,7 +37,7 @@ def scores(sequence: Sequence) -> list[float]:
     for moving in (False, True):
         corrector = replace(options.corrector, component=FusionCorrector(moving=moving))
         chosen = replace(options, corrector=corrector)
-        found = of_rig(frames, sequence.rig, sequence.shutter.readout_ratio, chosen, sigma=CardSigma(), close=True)
+        found = of_rig(frames, sequence.rig, KnownInputs.of(sequence.shutter), chosen, close=True)
         images.append(found.frames[_VIEW].image)
     everywhere = np.ones(truth.shape[:2], dtype=np.bool_)
     return [_psnr(image, truth, mask) for mask in (everywhere, _things(sequence, row)) for image in images]

@@ -30,8 +30,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.shutter import RollingShutter
+from rsbench.pipeline.camera_capture import find_shutter
 from rsbench.pipeline.footage import OneCameraCard, read_frame
-from rsbench.pipeline.mono_camera import find_shutter
 from rsbench.pipeline.mono_correction import FoundOwnMotion
 from rsbench.pipeline.mono_sequence import correct_frames
 from rsbench.solvers.engine.robust_motion import RobustOptions
@@ -72,7 +72,7 @@ def print_ratios(folder: Path) -> None:
                 continue
             assert found.capture is not None and found.capture.likeliest is not None
             ratio, focal = found.capture.likeliest, found.focal
-            row += f" {name}: {ratio.ratio:.3f} +- {ratio.sigma:.3f} ({found.scan})"
+            row += f" {name}: {ratio.ratio:.3f} +- {ratio.sigma:.3f} ({found.shutter.scan_of('left')})"
             row += ";" if focal is None else f", focal length {focal.focal:.0f} +- {focal.sigma:.0f} px;"
         sys.stdout.write(row + "\n")
         sys.stdout.flush()

@@ -57,10 +57,10 @@ from rsbench.core.rig import SIDES, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.interop.readers.calibration_parts import Assumptions, resized
 from rsbench.interop.readers.calibrations import read_calibration
+from rsbench.pipeline.camera_capture import find_focal
 from rsbench.pipeline.footage import FrameSource, OneCameraCard, RigCard, read_frame
-from rsbench.pipeline.frame_capture import find_matches_of_rig
+from rsbench.pipeline.frame_capture import KnownCapture, find_matches_of_rig
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.mono_camera import find_camera_alone
 from rsbench.pipeline.mono_correction import find_own_motion
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.fusion import Origin, inpaint
@@ -126,7 +126,8 @@ def score_pair(folder: Path, of: FrameSet) -> tuple[dict[int, Scores], str, floa
     started = time.perf_counter()
     if of.focal is None:
         card = OneCameraCard(readout_ratio=of.readout_ratio)
-        camera = find_camera_alone(images, 2, card, shutter, RobustOptions())[0]
+        known = KnownCapture(rig=StereoRig.of_one(card.camera_of(width, height)), shutter=shutter)
+        camera = find_focal(images, 2, card, known, RobustOptions()).rig.camera
     else:
         camera = PinholeCamera.centred(width, height, of.focal)
     rig = StereoRig(camera=camera, baseline=1.0)

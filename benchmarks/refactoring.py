@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 
 import rsbench
+from rsbench.capture.calibration import offset_error
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.rig_calibration import ERRORS, prior_of, refine_rig, with_errors
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
@@ -58,7 +60,8 @@ def _hash(*arrays: Any) -> str:
 
 def _four(sequence: Sequence, ratio: float | None, model: str | None, offset: float | None = None) -> Any:
     images, options = {view: sequence.image("rs", *view) for view in VIEWS}, CorrectionOptions(motion_model=model)
-    found = correct_four(images, sequence.rig, ratio, options, disparity_offset=offset)
+    errors = None if offset is None else offset_error(offset)
+    found = correct_four(images, sequence.rig, KnownInputs(readout_ratio=ratio, calibration=errors), options)
     assert found.motion is not None
     frames = [_hash(each.image, each.origin, each.depth) for each in found.frames.values()]
     return [*found.motion.w, *found.motion.d, found.shutter.readout_ratio, *frames]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.predict import true_pairs
 from rsbench.benchmark.images.score import visible_pixels
-from rsbench.capture.calibration import CardSigma
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import row_poses
 from rsbench.core.rig import FRAMES, VIEWS
@@ -66,7 +66,7 @@ def scores(sequence: Sequence) -> tuple[float, float, float]:
     options = options_of("rs-stereo-refined", "auto", "sgm", "sift-refined", "fusion", target_row=float(row))
     four = [images[view] for view in (("left", 0), ("right", 0), ("left", 1), ("right", 1))]
     try:
-        found = of_rig(four, sequence.rig, sequence.shutter.readout_ratio, options, sigma=CardSigma(), close=True)
+        found = of_rig(four, sequence.rig, KnownInputs.of(sequence.shutter), options, close=True)
         together = psnr(found.frames[_VIEW].image)
     except RsbenchError:
         together = float("nan")

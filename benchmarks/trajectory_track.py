@@ -33,6 +33,7 @@ import cv2
 import numpy as np
 
 from rsbench.benchmark.trajectory_scores import METHODS, Estimate, Given, TrueTrajectory, trajectory_scores
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.components.cards import card_path
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.motion import Motion
@@ -94,8 +95,8 @@ def _fused(pair: Sequence, motion: Motion, images: Any, pairs: Any) -> list[Any]
     options, shutter = CorrectionOptions(), pair.shutter
     given, view = chain.Given(motion=motion, pairs=pairs), ("left", 0)
     rows = (float(shutter.height // 2),)
-    ratio = shutter.readout_ratio
-    found = correct_four(images, pair.rig, ratio, options, given=given, views=(view,), rows=rows)
+    inputs = KnownInputs.of(shutter)
+    found = correct_four(images, pair.rig, inputs, options, given=given, views=(view,), rows=rows)
     return [found.frames[view], *(each[view] for each in found.at_rows)]
 
 

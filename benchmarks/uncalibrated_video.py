@@ -32,8 +32,8 @@ from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.camera_capture import find_focal, find_shutter
 from rsbench.pipeline.footage import OneCameraCard
-from rsbench.pipeline.mono_camera import find_camera_alone, find_shutter
 from rsbench.pipeline.mono_sequence import correct_frames
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
@@ -173,17 +173,22 @@ def measured(case: Case, seed: int) -> dict[str, Any]:
     row["before"] = [round(psnr(*both), 2) for both in zip(frames, truths, strict=True)]
     try:
         found = find_shutter(frames, len(frames), card, options)
-        camera, alone = find_camera_alone(frames, len(frames), card, found.shutter, options, found=found.focal)
+        found = found if found.focal is not None else find_focal(frames, len(frames), card, found, options)
     except NoMotionError as error:
         row |= {"refused": str(error), "gains": [0.0] * len(frames)}
     else:
-        assert found.capture is not None and alone is not None
-        best = found.capture.likeliest
+        assert found.capture is not None and found.focal is not None
+        best, alone = found.capture.likeliest, found.focal
         assert best is not None
-        row |= {"found": best.ratio, "sigma": best.sigma, "p": best.probability, "scan": found.scan}
+        row |= {
+            "found": best.ratio,
+            "sigma": best.sigma,
+            "p": best.probability,
+            "scan": found.shutter.scan_of("left"),
+        }
         row |= {"found_focal": alone.focal, "sigma_focal": alone.sigma, "determined": alone.determined}
         row["s"] = round(time.process_time() - began, 1)
-        row["gains"], row["left"] = gains(frames, truths, camera, found.shutter)
+        row["gains"], row["left"] = gains(frames, truths, found.rig.camera, found.shutter)
     known = PinholeCamera.centred(*SIZE, focal)
     row["known"], row["known_left"] = gains(
         frames, truths, known, RollingShutter(height=SIZE[1], readout_ratio=case[1])

@@ -24,8 +24,8 @@ from rsbench.capture.self_calibration import FoundCamera
 from rsbench.core.camera import Lens
 from rsbench.core.rig import SIDES, StereoRig
 from rsbench.pipeline.footage import read_frame, read_rig_card
+from rsbench.pipeline.frame_capture import camera_of_frames
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.sequence_capture import camera_of_frames
 
 _LONGER, _LARGER = 1.05, 0.03
 _SURE, _SURE_K1 = 0.1, 0.05
@@ -41,7 +41,7 @@ def true_and_found(folder: Path) -> tuple[StereoRig, FoundCamera]:
     camera = replace(camera, fx=_LONGER * camera.fx, fy=_LONGER * camera.fy, lens=wrong)
     sigma = CardSigma(focal=_SURE * camera.fx, k1=_SURE_K1)
     given = replace(rig, camera=camera)
-    found = camera_of_frames([images], given, sigma, CorrectionOptions(), KnownInputs())
+    found = camera_of_frames([images], given, CorrectionOptions(), KnownInputs(sigma=sigma))
     return rig, found
 
 

@@ -32,10 +32,10 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import FrameSource, read_frame
-from rsbench.pipeline.frame_capture import know_matches, match_frames
+from rsbench.pipeline.frame_capture import know_matches, match_frames, with_found_camera
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import solve_frames
-from rsbench.pipeline.sequence_capture import camera_of_frames, estimate_sequence_capture, spread_windows
+from rsbench.pipeline.sequence_capture import estimate_sequence_capture, spread_windows
 from rsbench.vision.feature_matcher import load_features
 
 Step = tuple[FloatArray, FloatArray]
@@ -190,11 +190,10 @@ def score(given: argparse.Namespace) -> list[str]:
         raise RsbenchError(
             f"{given.folder}: {len(files[0])} left and {len(files[1])} right images, {len(poses)} poses"
         )
-    ratio, lines, inputs = given.ratio, list[str](), KnownInputs(readout_ratio=given.ratio)
-    if sigma := CardSigma(focal=given.focal_sigma, k1=given.k1_sigma):
-        found = camera_of_frames(spread_windows(*sources), rig, sigma, options, inputs)
-        lines.append(found.words(rig, sigma))
-        rig = found.rig
+    ratio, lines, sigma = given.ratio, list[str](), CardSigma(focal=given.focal_sigma, k1=given.k1_sigma)
+    inputs = KnownInputs(readout_ratio=ratio, sigma=sigma)
+    rig, words = with_found_camera(rig, spread_windows(*sources), options, inputs)
+    lines += [words] if words else []
     capture, calibration = None, NO_ERRORS
     try:
         capture, shutter = estimate_sequence_capture(sources[0], sources[1], rig, options, inputs)
@@ -217,7 +216,7 @@ def score(given: argparse.Namespace) -> list[str]:
         try:
             inputs = KnownInputs(readout_ratio=ratio, calibration=calibration)
             matches = match_frames(images, rig, options)
-            motion = solve_frames(*know_matches(matches, rig, inputs, options), options)
+            motion = solve_frames(know_matches(matches, rig, inputs, options), options)
         except RsbenchError as error:
             refused += 1
             lines.append(f"{k:4d}  {error}")

@@ -66,7 +66,7 @@ def test_what_travels_together_is_one_object() -> None:
     assert not many, f"functions of more than {MAX_ARGUMENTS} arguments: {many}"
 
 
-_OF_MANY = {"correct_four", "solver"}
+_OF_MANY = {"solver"}
 
 
 @in_checkout

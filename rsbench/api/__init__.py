@@ -567,6 +567,7 @@ def correct(
         RsbenchError: frames that are not what they should be; no such component; no motion; no correction.
     """
     from rsbench.capture.calibration import CardSigma
+    from rsbench.capture.hypotheses import KnownInputs
     from rsbench.pipeline import arrays as array_correction
 
     arguments.check_one_of("inpaint", inpaint, (None, True, False))
@@ -595,11 +596,10 @@ def correct(
     arguments.check_number("focal_sigma", focal_sigma, 0.0, 0.3 * abs(rig.camera.fx))
     arguments.check_number("k1_sigma", k1_sigma, 0.0, 0.3)
     sigma = CardSigma(focal=float(focal_sigma), k1=float(k1_sigma))
+    inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning, sigma=sigma)
     components = solver, motion_model, matcher, features, corrector
     options = array_correction.options_of(*components, target_row=target_row, inpaint=bool(inpaint), seed=seed)
-    return array_correction.of_rig(
-        images, rig, readout_ratio, options, gyro, scanning=scanning, sigma=sigma, close=inpaint is None
-    )
+    return array_correction.of_rig(images, rig, inputs, options, gyro, close=inpaint is None)
 
 
 def _check_own(*components: object) -> None:

@@ -8,14 +8,14 @@ errors) jointly, by a damped Newton method on compiled equations with a heavy-ta
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS, STRETCHING, TERMS, ray_shifts, ray_stretches
+from rsbench.capture.calibration import NO_ERRORS, STRETCHING, TERMS, CardSigma, ray_shifts, ray_stretches
 from rsbench.components.motion_kernels import MotionKernel
 from rsbench.components.motion_models import AcceleratedKernel, any_law, load_kernel
 from rsbench.core.correspondences import BoolArray, Correspondences, unlinked_pairs
@@ -153,7 +153,14 @@ class KnownInputs:
     """Scan of each camera, delay and ratio of the right one."""
     calibration: tuple[float, ...] | None = None
     """Calibration errors, see ``calibration.TERMS``."""
+    sigma: CardSigma = field(default_factory=CardSigma)
+    """Standard deviations of the rig's focal length and k1; a value with 0 is exact."""
     models: tuple[str, ...] = MODELS
+
+    @classmethod
+    def of(cls, shutter: RollingShutter) -> KnownInputs:
+        """The inputs for a known shutter."""
+        return cls(readout_ratio=shutter.readout_ratio, scanning=shutter.scanning)
 
     @property
     def reading(self) -> Scanning:

@@ -23,6 +23,11 @@ _SAME_DEG, _SAME_PERCENT = 1e-3, 1e-3
 """Motions that differ by less are the same, as those of all models are under a global shutter."""
 
 
+def compared_models(motion_model: str | None) -> tuple[str, ...]:
+    """The motion models to compare: all for ``auto`` or None, otherwise the requested one."""
+    return MODELS if motion_model in (None, AUTO) else (str(motion_model),)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ModelChoice:
     """The motion model that is used, and how it was chosen."""

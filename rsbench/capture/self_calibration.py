@@ -24,7 +24,7 @@ from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.solvers.engine.robust_motion import RobustOptions
 
@@ -90,7 +90,7 @@ def find_camera(
     Args:
         windows: matches of two frame times each.
         sigma: standard deviations of the card's values; values with 0 are not estimated.
-        given: as for ``known_of``; with a readout ratio and no scanning, rows are read from the top.
+        given: as for ``known_of``.
 
     Raises:
         RsbenchError: ``sigma.k1`` is given for a lens model without k1.
@@ -98,8 +98,6 @@ def find_camera(
     given, lens = given or KnownInputs(), rig.camera.lens
     if sigma.k1 and lens is not None and lens.model == "double-sphere":
         raise RsbenchError(f"k1_sigma = {sigma.k1}: a double-sphere lens has no k1; leave it out")
-    if given.readout_ratio is not None and given.scanning is None:
-        given = replace(given, scanning=Scanning())
     known = known_of(windows[0], rig, given)
     later = sigma.k1 > 0.0 and known.calibration_sigma[OFFSET] > 0.0
     found, determined, last = rig, np.zeros(2, dtype=np.bool_), np.zeros(2)

@@ -77,13 +77,15 @@ class NoMotionError(RsbenchError):
 def known_of(matches: Correspondences, rig: StereoRig, given: KnownInputs) -> Known:
     """Convert given values to what is known about a capture before its matches are fitted.
 
-    If no calibration errors are given, they are estimated where the row differences of left-right matches show
-    some; the size of these differences sets their prior.
+    With a readout ratio and no scanning, rows are read from the top. If no calibration errors are given, they are
+    estimated where the row differences of left-right matches show some; the size of these differences sets their
+    prior.
 
     Raises:
         RsbenchError: a readout ratio of the right camera is given, but none of the left one.
     """
-    ratio, scanning, scans = given.readout_ratio, given.scanning, ALL_SCANS
+    ratio, scans = given.readout_ratio, ALL_SCANS
+    scanning = given.scanning if ratio is None else given.reading
     if scanning is not None:
         if ratio is None and scanning.right_readout_ratio is not None:
             raise RsbenchError(
@@ -161,13 +163,14 @@ def shutter_found(capture: Capture, rig: StereoRig) -> RollingShutter:
     """
     best = capture.likeliest
     if best is None:
-        raise NoMotionError(f"cannot tell how the cameras read: {capture.reason}")
+        raise NoMotionError(_cannot_tell(capture, rig))
+    still = capture.moved_px <= _HARMLESS_PX and rig.metric
     harmless = best.sigma * capture.moved_px <= _HARMLESS_PX or best.scans == GLOBAL
-    named = best.probability >= CERTAIN or capture.moved_px <= _HARMLESS_PX
-    rolls = not best.scans.rolls or best.ratio >= _ROLLING_SIGMAS * best.sigma or harmless
-    if not named or not rolls or not (best.sigma <= _MAX_SIGMA or harmless):
-        raise NoMotionError(cannot_tell(capture))
-    return shutter_of(best, rig)
+    rolls = not best.scans.rolls or best.ratio >= _ROLLING_SIGMAS * best.sigma
+    largest = _MAX_SIGMA if rig.metric else min(_MAX_SIGMA, _MAX_SHARE * best.ratio)
+    if (best.probability >= CERTAIN or still) and (harmless or (rolls and best.sigma <= largest)):
+        return shutter_of(best, rig)
+    raise NoMotionError(_cannot_tell(capture, rig))
 
 
 def shutter_of(candidate: Candidate, rig: StereoRig) -> RollingShutter:
@@ -184,14 +187,31 @@ def shutter_of(candidate: Candidate, rig: StereoRig) -> RollingShutter:
     return shutter_under(candidate.scans, candidate.ratio, rig, delay)
 
 
-def cannot_tell(capture: Capture) -> str:
+def _cannot_tell(capture: Capture, rig: StereoRig) -> str:
     """Message on what the matches leave undetermined, what compensates for the ratio, and the remedy."""
-    text = f"cannot tell the readout ratio: {capture.reason}"
-    peak = capture.peaks.get(capture.motion_model)
-    best = capture.likeliest
-    if best is not None and peak is not None and best.sigma > _MAX_SIGMA:
-        text += f"; a larger ratio goes with {_trade(peak)}"
-    return f"{text}. Give readout_ratio in the rig's card, or frames in which the rig turns, or more frames"
+    who, best = "rig" if rig.metric else "camera", capture.likeliest
+    if best is None:
+        text = f"how the {'cameras read' if rig.metric else 'camera reads'}: {capture.reason}"
+    else:
+        text = f"the readout ratio: {capture.reason if rig.metric else f'the frames show {_readings(capture)}'}"
+        if rig.metric and best.sigma > _MAX_SIGMA and (peak := capture.peaks.get(capture.motion_model)):
+            text += f"; a larger ratio goes with {_trade(peak)}"
+    remedy = f"Give readout_ratio in the {who}'s card, or frames in which the {who} turns, or more frames"
+    return f"cannot tell {text}. {remedy}"
+
+
+def _readings(capture: Capture) -> str:
+    """How one camera may read, as text."""
+
+    def reading_of(candidate: Candidate) -> str:
+        start = candidate.scans.left
+        return "all lines read at once" if start == "global" else f"lines read from the {start}"
+
+    best = capture.candidates[0]
+    if best.probability >= CERTAIN:
+        return f"{reading_of(best)}, but not how fast: {best.ratio:.2f} +- {best.sigma:.2f}"
+    likely = [each for each in capture.candidates if each.probability > 0.1]
+    return ", or ".join(f"{reading_of(each)} ({each.probability:.0%})" for each in likely) or "any shutter"
 
 
 def _trade(peak: Peak) -> str:
@@ -331,30 +351,3 @@ def conclude_alone(windows: Sequence[Window]) -> Capture:
     capture = conclude(windows)
     candidates = nearly_global(capture)
     return capture if candidates is None else replace(capture, candidates=candidates, named=True)
-
-
-def shutter_alone(capture: Capture, camera: PinholeCamera) -> RollingShutter:
-    """The shutter of the most probable candidate.
-
-    Raises:
-        NoMotionError: there is none, or it is too uncertain and its error would matter.
-    """
-
-    def reading_of(candidate: Candidate) -> str:
-        start = candidate.scans.left
-        return "all lines read at once" if start == "global" else f"lines read from the {start}"
-
-    remedy = "Give readout_ratio in the camera's card, or frames in which the camera turns, or more frames"
-    best = capture.likeliest
-    if best is None:
-        raise NoMotionError(f"cannot tell how the camera reads: {capture.reason}. {remedy}")
-    certain = best.probability >= CERTAIN
-    harmless = best.sigma * capture.moved_px <= _HARMLESS_PX or best.scans == GLOBAL
-    if certain and (best.sigma <= min(_MAX_SIGMA, _MAX_SHARE * best.ratio) or harmless):
-        return shutter_of(best, StereoRig.of_one(camera))
-    if certain:
-        how = f"{reading_of(best)}, but not how fast: {best.ratio:.2f} +- {best.sigma:.2f}"
-    else:
-        likely = [each for each in capture.candidates if each.probability > 0.1]
-        how = ", or ".join(f"{reading_of(each)} ({each.probability:.0%})" for each in likely) or "any shutter"
-    raise NoMotionError(f"cannot tell the readout ratio: the frames show {how}. {remedy}")

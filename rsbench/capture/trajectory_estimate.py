@@ -164,12 +164,9 @@ def estimate_trajectory(
         raise ValueError("a trajectory needs tracks: matches of both cameras over time")
     if motions is None:
         motions = window_motions(windows, rig, shutter, options.seed)
-    inputs = _Inputs(windows, rig, shutter, motions, options, None if gyro is None else gyro_steps(gyro))
-    found, tracks = inputs.fitted()
-    used = None if found.drift is None else GyroFound.of(found.drift)
-    if tracks.gyro is not None and found.drift is not None and contradicts(tracks.gyro, found.drift):
-        used = GyroFound.of(found.drift, used=False)
-        found, tracks = replace(inputs, gyro=None).fitted()
+    state = _State(rig, shutter, options, None if gyro is None else gyro_steps(gyro))
+    state.windows, state.motions = windows, list(motions)
+    found, tracks = state.solve(at_once=True)
     masks = tuple(found.trust[each] > 0.0 for each in tracks.members)
     inliers = tuple(mask[: len(window.tracks)] for mask, window in zip(masks, windows, strict=True))
     return Trajectory(
@@ -182,51 +179,8 @@ def estimate_trajectory(
         supported=np.array([is_supported(mask, found.tails) for mask in inliers]),
         fit=found,
         covariance_band=covariance_band(found, tracks),
-        gyro=used,
+        gyro=state.gyro_found(found),
     )
-
-
-@dataclass(frozen=True)
-class _Inputs:
-    """The inputs from which a trajectory is estimated."""
-
-    windows: Sequence[Correspondences]
-    rig: StereoRig
-    shutter: RollingShutter
-    motions: Sequence[Motion | None]
-    options: TrajectoryOptions
-    gyro: GyroSteps | None
-
-    def fitted(self) -> tuple[Fit, TimedTracks]:
-        """The fitted spline, and the tracks that it was fitted to."""
-        options = self.options
-        found, tracks = self._first(_FIRST_WINDOWS, options.intervals[0], options.prior)
-        if options.learn:
-            found = choose(found, tracks, options.intervals)
-        if len(self.windows) > _FIRST_WINDOWS:
-            found, tracks = self._first(len(self.windows), found.curve.interval, found.prior, found.drift)
-        if options.link:
-            right = [found.trust[each] for each in tracks.members]
-            tracks = self._packed(len(self.windows), found.drift, right)
-            found = fit(found.curve, tracks, found.prior, options.learn, found.tails, drift=found.drift)
-        return found, tracks
-
-    def _first(
-        self, count: int, interval: float, prior: Prior, drift: Drift | None = None
-    ) -> tuple[Fit, TimedTracks]:
-        """A spline fitted to the first ``count`` windows, and their tracks."""
-        tracks, motions = self._packed(count, drift), self.motions[:count]
-        curve = first_curve(motions, tracks, span_of(len(motions), self.shutter), interval)
-        return fit(curve, tracks, prior, self.options.learn, drift=drift), tracks
-
-    def _packed(self, count: int, drift: Drift | None, right: Sequence[FloatArray] | None = None) -> TimedTracks:
-        windows = self.windows[:count]
-        tracks = pack_windows(windows, self.rig, self.shutter, right, share=self.options.share)
-        if self.gyro is None:
-            return tracks
-        shift = 0.0 if drift is None else drift.shift
-        first, last = span_of(len(windows), self.shutter)
-        return replace(tracks, gyro=self.gyro.between(first - shift, last - shift))
 
 
 def noise_px(tails: Tails) -> float:
@@ -295,7 +249,7 @@ def stream_trajectory(
 
 
 class _State:
-    """The state of a stream: the current windows, and a quadratic cost in place of the dropped ones."""
+    """The current windows of a sequence or stream, and a quadratic cost in place of the dropped ones."""
 
     def __init__(
         self, rig: StereoRig, shutter: RollingShutter, options: TrajectoryOptions, gyro: GyroSteps | None
@@ -334,24 +288,51 @@ class _State:
         last = span_of(self.first + len(windows), self.shutter)[1] - shift
         return replace(tracks, gyro=self.gyro.between(first, last))
 
-    def solve(self) -> tuple[Fit, TimedTracks]:
-        """Fit the spline to all current windows; a gyroscope that contradicts the matches is dropped."""
-        found, tracks = self._solved()
+    def solve(self, at_once: bool = False) -> tuple[Fit, TimedTracks]:
+        """Fit the spline to all current windows; a gyroscope that contradicts the matches is dropped.
+
+        ``at_once``: the windows are a whole sequence.
+        """
+        solved = self._solved_at_once if at_once else self._solved
+        found, tracks = solved()
         if tracks.gyro is None or found.drift is None or not contradicts(tracks.gyro, found.drift):
             return found, tracks
         self.gyro, self.rejected_gyro = None, GyroFound.of(found.drift, used=False)
         self.past = None if self.past is None else self.past.without_gyro()
         self.fit = None if self.fit is None else replace(self.fit, drift=None)
-        return self._solved()
+        return solved()
+
+    def gyro_found(self, found: Fit) -> GyroFound | None:
+        """The estimates for a gyroscope; None: there is none."""
+        return self.rejected_gyro if found.drift is None else GyroFound.of(found.drift)
+
+    def _solved_at_once(self) -> tuple[Fit, TimedTracks]:
+        """The spline fitted to a whole sequence, after a first fit to the first windows, and its tracks."""
+        options, windows = self.options, self.windows
+        found, tracks = self._first_fit(windows[:_FIRST_WINDOWS], options.intervals[0], options.prior)
+        if options.learn:
+            found = choose(found, tracks, options.intervals)
+        if len(windows) > _FIRST_WINDOWS:
+            found, tracks = self._first_fit(windows, found.curve.interval, found.prior, found.drift)
+        if options.link:
+            tracks = self._pack(windows, [found.trust[each] for each in tracks.members], found.drift)
+            found = fit(found.curve, tracks, found.prior, options.learn, found.tails, drift=found.drift)
+        return found, tracks
+
+    def _first_fit(
+        self, windows: Sequence[Correspondences], interval: float, prior: Prior, drift: Drift | None = None
+    ) -> tuple[Fit, TimedTracks]:
+        """A spline fitted to the first windows, without one to start from, and their tracks."""
+        tracks, count = self._pack(windows, drift=drift), len(windows)
+        curve = first_curve(self.motions[:count], tracks, span_of(count, self.shutter), interval)
+        return fit(curve, tracks, prior, self.options.learn, drift=drift), tracks
 
     def _solved(self) -> tuple[Fit, TimedTracks]:
-        """Fit the spline, after a first fit to some of the tracks that selects the inliers."""
+        """The spline fitted to a part of a stream, after a first fit to some tracks that selects the inliers."""
         count, options = len(self.windows), self.options
         few = thinned(self.windows, _FIRST_TRACKS)
         if self.curve is None or self.fit is None:
-            tracks = self._pack(few)
-            curve = first_curve(self.motions, tracks, span_of(count, self.shutter), options.intervals[0])
-            found = fit(curve, tracks, options.prior, options.learn)
+            found, tracks = self._first_fit(few, options.intervals[0], options.prior)
             found = choose(found, tracks, options.intervals) if options.learn else found
         else:
             start = self.first + count - self.fresh
@@ -383,7 +364,7 @@ class _State:
                 inliers=right[number - self.first],
                 apart=min(abs(number - each) for each in supported),
                 noise_px=noise_px(found.tails),
-                gyro=self.rejected_gyro if found.drift is None else GyroFound.of(found.drift),
+                gyro=self.gyro_found(found),
             )
         self._supported = max(each for each in supported if each < self.first + count)
 

@@ -151,7 +151,7 @@ def parts() -> list[Callable[[], object]]:
         lambda: two_frame_spline(shaking, rig, shutter, LinearMotion(shaken.w, shaken.d)),
         lambda: find_depth(images, rig, shutter, motion, options),
         corrected,
-        lambda: [solve_frames(*know_matches(each, rig, known, options), options) for each in (straight, turning)],
+        lambda: [solve_frames(know_matches(each, rig, known, options), options) for each in (straight, turning)],
         lambda: match_frames(images, rig, options),
     ]
 

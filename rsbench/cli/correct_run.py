@@ -14,16 +14,13 @@ from typing import Any
 import numpy as np
 import typer
 
-from rsbench.capture.calibration import NO_ERRORS
 from rsbench.capture.shutter_decision import NoMotionError
-from rsbench.capture.two_frame_estimate import Capture
 from rsbench.cli.compile_ahead import compiling_ahead
 from rsbench.cli.console import echo, progress_bar
 from rsbench.cli.correct_input import CorrectInput, target_row
 from rsbench.components.imports import component_key
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import SIDES, StereoRig
-from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.rig import SIDES
 from rsbench.core.version import __version__
 from rsbench.dataset import corrected_frames as results
 from rsbench.interop.writers.rectified_pairs import write_calibration, write_rectified
@@ -32,7 +29,7 @@ from rsbench.pipeline.footage import FORECAST, FrameSource, RigCard, read_four
 from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.isolated_chain import Isolation
-from rsbench.pipeline.sequence_capture import CorrectedMoment, Gyroscope, know_capture, with_found_camera
+from rsbench.pipeline.sequence_capture import CorrectedMoment, Gyroscope, know_capture
 from rsbench.pipeline.sequence_correction import correct_sequence, takes_gyro
 from rsbench.report.corrected_page import (
     card_of,
@@ -50,8 +47,6 @@ from rsbench.vision.fusion import finished
 
 _MOST_LISTED = 8
 SUBTITLE = "Rolling shutter to global shutter"
-UNIT = "length of the translation over one frame period"
-"""Unit of the depth of one camera's frames."""
 
 
 def motion_facts(motion: dict[str, Any] | None) -> list[tuple[str, str]]:
@@ -86,11 +81,12 @@ def camera_facts(record: dict[str, Any]) -> dict[str, str]:
     return {**facts, "gyroscope's clock": words}
 
 
-def readout_words(shutter: RollingShutter, capture: Capture | None, rig: StereoRig) -> str:
+def readout_words(known: KnownCapture) -> str:
+    shutter, capture = known.shutter, known.capture
     best = None if capture is None else capture.likeliest
     if capture is None or best is None:
         return f"{shutter.readout_ratio:.3f} (given)"
-    if not rig.metric:
+    if not known.rig.metric:
         side = f"from the {shutter.scan_of('left')}, which is the right side with a probability of"
         return f"{best.ratio:.3f} +- {best.sigma:.3f} (found), {side} {best.probability:.0%}"
     odds = f"probability that the cameras read so {best.probability:.0%}"
@@ -152,19 +148,10 @@ def _correct_four(given: CorrectInput, target: str, options: CorrectionOptions, 
     rig = card.rig_of(images["left", 0], images["right", 0])
     options = replace(options, target_row=target_row(target, images["left", 0].shape[0]))
     with results.fresh_folder(out) as folder:
-        rig, focal = with_found_camera(rig, card.sigma, [images], options, card.inputs, progress_bar)
         with progress_bar("correcting", 4) as advance:
-            result = correct_four(
-                images,
-                rig,
-                card.readout_ratio,
-                options,
-                advance,
-                disparity_offset=card.disparity_offset,
-                scanning=card.scanning,
-            )
+            result = correct_four(images, rig, card.inputs, options, advance)
         demand_corrected(result.frames, options.corrector.name)
-        rig = result.rig
+        known, rig = result.known, result.rig
         frames = {view: finished(fused) if close else fused for view, fused in result.frames.items()}
         for (side, frame), fused in frames.items():
             results.write_frame(folder, f"{side}_{frame}", fused)
@@ -172,15 +159,13 @@ def _correct_four(given: CorrectInput, target: str, options: CorrectionOptions, 
                 write_rectified(folder, f"{side}_{frame}", fused, rig, side)
         if given.rectify:
             write_calibration(folder, rig)
-        calibration = (card.inputs.calibration or NO_ERRORS) if result.found is None else result.found.calibration
-        record = results.rig_record(rig, result.shutter, result.capture, options, calibration, result.rig_found)
-        record["camera_note"] = focal
+        record = results.capture_record(known, options)
         record["motion"] = None if result.found is None else results.motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}
         record["seconds"] = result.seconds
         results.write_record(folder, record)
         cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in frames.items()]
-        read = readout_words(result.shutter, result.capture, rig)
+        read = readout_words(known)
         facts = [("readout ratio", read), *motion_facts(record["motion"])]
         write_page(folder, f"rsbench correct: {out.name}", SUBTITLE, facts, cards)
     _say_four(out, f"readout ratio {read}", record)
@@ -214,14 +199,14 @@ def _correct_sequence(given: CorrectInput, target: str, options: CorrectionOptio
     first = [next(iter(source)) for source in sources]
     options = replace(options, target_row=target_row(target, first[0].shape[0]))
     if isinstance(card, RigCard):
-        check_cameras(card.rig_of(*first), card.scanning or Scanning(), options, card.disparity_offset)
+        check_cameras(card.rig_of(*first), card.inputs.reading, options, card.disparity_offset or 0.0)
         _warn_of_times(sources)
     else:
         _say_input(given, sources[0], first[0].shape, options)
     run = _run_key(given, sources, options, close, gyro)
     with results.video_place(out, run) if given.video else results.fresh_folder(out, run=run) as folder:
         known = know_capture(sources, card, options, gyro, progress_bar)
-        record = _record(known, options)
+        record = results.capture_record(known, options)
         record["frames"] = _correct_into(folder, sources, known, options, close, given)
         if given.video:
             others = _write_page(folder, given, sources[0], record, known)
@@ -283,14 +268,6 @@ def _run_key(
     parts += [each for source in sources for each in source.identity()]
     parts += [] if gyro is None else [hashlib.sha256(gyro.samples.tobytes()).hexdigest(), repr(gyro.clock_error)]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
-
-def _record(known: KnownCapture, options: CorrectionOptions) -> dict[str, Any]:
-    """What motion.json says of the cameras, as given or estimated, without the frames."""
-    if not known.rig.metric:
-        return results.camera_alone_record(known, options, UNIT)
-    rig = results.rig_record(known.rig, known.shutter, known.capture, options, known.calibration, known.rig_found)
-    return {**rig, "camera_note": known.camera_note}
 
 
 def _correct_into(
@@ -376,13 +353,13 @@ def _write_page(
         deque(shown, maxlen=0)
     results.join_poses(folder, "row_poses")
     results.join_poses(folder, "trajectory")
-    facts = [("readout ratio", readout_words(known.shutter, known.capture, known.rig))]
+    facts = [("readout ratio", readout_words(known))]
     facts += [*camera_facts(record).items()] if one else []
     corrected = sum("reason" not in each for each in frames)
     facts += [("frames corrected" if one else "times corrected", f"{corrected} of {len(frames)}")]
     if changed:
         facts += [("change of a frame", f"{max(changed):.1f} grey levels at most, mean over its pixels")]
-    facts += [("unit of depth", UNIT)] if one else []
+    facts += [("unit of depth", record["units"]["length"])] if one else []
     chosen = most_changed(changed, _PAGE_FRAMES) if changed else []
     shown_frames = source.only(numbers[k] for k in chosen) if chosen else ()
     title, unit = ("frame {}", "") if one else ("left, frame {}", " m")
@@ -433,7 +410,7 @@ def _say(given: CorrectInput, known: KnownCapture, record: dict[str, Any], lines
     if len(reasons) == 1 and None not in reasons:
         failed = f"all {len(frames)} {'frames' if one else 'times'}: {reasons.pop()}"
     remedy = ": --readout-ratio or --shutter gives it" if one and known.capture is not None else ""
-    echo(f"readout ratio {readout_words(known.shutter, known.capture, known.rig)}{remedy}")
+    echo(f"readout ratio {readout_words(known)}{remedy}")
     if one:
         facts = camera_facts(record)
         remedy = "" if known.focal is None else ": --fov or --camera gives it"

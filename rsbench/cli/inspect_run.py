@@ -21,11 +21,11 @@ from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
 from rsbench.interop.readers.rig_files import read_rig_file
 from rsbench.pipeline.footage import FrameSource, check_alike
-from rsbench.pipeline.frame_capture import find_matches_of_rig
+from rsbench.pipeline.frame_capture import find_matches_of_rig, with_found_camera
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.isolated_chain import Isolation
 from rsbench.pipeline.problem import read_problems
-from rsbench.pipeline.sequence_capture import spread_windows, with_found_camera
+from rsbench.pipeline.sequence_capture import spread_windows
 from rsbench.vision.feature_matcher import load_features
 
 
@@ -89,9 +89,9 @@ def _of_frames(left: FrameSource, right: FrameSource, card: Path, options: Inspe
     ratio, scanning = given.readout_ratio, given.scanning
     with naming(card):
         shutter = None if ratio is None or scanning is None else rig.shutter_of(scanning, ratio)
-    if given.sigma:
+    if given.inputs.sigma:
         shown = spread_windows(left, right)
-        rig, words = with_found_camera(rig, given.sigma, shown, options.chain, given.inputs, progress_bar)
+        rig, words = with_found_camera(rig, shown, options.chain, given.inputs, progress_bar)
         echo(words, err=True)
     return _of_windows(card.stem, left, right, rig, shutter, options)
 

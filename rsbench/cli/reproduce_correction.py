@@ -21,6 +21,7 @@ from rsbench.benchmark.studies.correction_study import (
 )
 from rsbench.benchmark.studies.fig4_panels import Panels, correct_literally, load_panels, make_panels, save_panels
 from rsbench.benchmark.studies.sgm_timing import TIMINGS, Timing, compare, right_row_poses
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.cli.console import echo, progress_bar
 from rsbench.cli.generate import generate
 from rsbench.components.cards import load_card
@@ -193,9 +194,8 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
 def _draw_real(places: dict[str, Path], folder: Path) -> Path:
     ideal, real = (read_sequence(places[camera] / _SHOWN) for camera in ("ideal", "real"))
     images = {view: real.image("rs", *view) for view in VIEWS}
-    ratio, scanning = real.shutter.readout_ratio, real.shutter.scanning
-    options = CorrectionOptions(inpaint=True)
-    corrected = correct_four(images, real.rig, ratio, options, views=(("left", 1),), scanning=scanning)
+    options, inputs = CorrectionOptions(inpaint=True), KnownInputs.of(real.shutter)
+    corrected = correct_four(images, real.rig, inputs, options, views=(("left", 1),))
     frames = {
         "ideal camera": ideal.image("rs", "left", 1),
         "real camera": images["left", 1],

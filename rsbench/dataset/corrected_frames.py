@@ -13,19 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, TERMS, describe_errors
-from rsbench.capture.rig_calibration import FoundRig
+from rsbench.capture.calibration import OFFSET, TERMS, describe_errors
 from rsbench.capture.shutter_decision import record_of
 from rsbench.capture.trajectory_gyro import GyroFound
-from rsbench.capture.two_frame_estimate import Capture
 from rsbench.components.motion_models import AcceleratedMotion
 from rsbench.components.rig_tables import camera_record
 from rsbench.core import so3
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose, inverse
-from rsbench.core.shutter import RollingShutter
 from rsbench.dataset.sequence import cameras_record
 from rsbench.pipeline.footage import FrameSource, read_frame
 from rsbench.pipeline.frame_capture import KnownCapture
@@ -58,6 +54,8 @@ MASK_VALUES = {
 }
 """Grey value of each origin in the mask files, larger for more reliable origins."""
 MARKER = "motion.json"
+ALONE_UNIT = "length of the translation over one frame period"
+"""Unit of the depth of one camera's frames."""
 _HALF = "half"
 """Name of the folder, in the hidden one, from which a killed run is resumed."""
 _ENTRIES = f"{HIDDEN}/frames"
@@ -272,54 +270,46 @@ def _ideal_record(camera: PinholeCamera) -> dict[str, Any]:
     return {"camera": known, "lens": lens}
 
 
-def rig_record(
-    rig: StereoRig,
-    shutter_: RollingShutter,
-    capture: Capture | None,
-    options: CorrectionOptions,
-    calibration: tuple[float, ...] = NO_ERRORS,
-    rig_found: FoundRig | None = None,
-) -> dict[str, Any]:
-    """Assumptions, estimates and components of the correction, for JSON."""
+def capture_record(known: KnownCapture, options: CorrectionOptions) -> dict[str, Any]:
+    """What the correction of a rig's or of one camera's frames assumed or estimated, ready for JSON."""
+    rig, capture, alone = known.rig, known.capture, not known.rig.metric
     best = None if capture is None else capture.likeliest
-    components = {name: {"name": entry.name, "key": entry.key} for name, entry in options.components.items()}
-    return {
-        "units": {"length": "m", "angle": "rad", "time": "frame period", "depth": "m, 0 = infinite or unknown"},
+    unit, unknown = (ALONE_UNIT, "unknown") if alone else ("m", "infinite or unknown")
+    record = {
+        "units": {"length": unit, "angle": "rad", "time": "frame period", "depth": f"{unit}, 0 = {unknown}"},
         **(_ideal_record(rig.camera) if rig.aligned else cameras_record(rig)),
-        "scan": shutter_.scanning.record,
-        "baseline": rig.baseline,
-        "readout_ratio": shutter_.readout_ratio,
+        "scan": known.shutter.scan_of("left") if alone else known.shutter.scanning.record,
+        "readout_ratio": known.shutter.readout_ratio,
         "readout_ratio_sigma": None if best is None else best.sigma,
         "readout_ratio_estimated": capture is not None,
-        "disparity_offset": calibration[OFFSET],
-        "disparity_offset_sigma": None if capture is None else capture.offset_sigma,
-        "calibration_errors": dict(zip(TERMS, calibration, strict=True)) if any(calibration) else None,
-        "calibration_note": describe_errors(calibration, rig) if rig_found is None else rig_found.words,
-        **({} if rig_found is None else {"rig_errors": rig_found.record}),
         "capture": None if capture is None else record_of(capture),
         "target_row": options.target_row,
-        "components": components,
         "mask_values": {origin.name.lower(): value for origin, value in MASK_VALUES.items()},
+    }
+    return record | (_camera_record(known, options) if alone else _rig_record(known, options))
+
+
+def _rig_record(known: KnownCapture, options: CorrectionOptions) -> dict[str, Any]:
+    errors, found = known.calibration, known.rig_found
+    return {
+        "baseline": known.rig.baseline,
+        "disparity_offset": errors[OFFSET],
+        "disparity_offset_sigma": None if known.capture is None else known.capture.offset_sigma,
+        "calibration_errors": dict(zip(TERMS, errors, strict=True)) if any(errors) else None,
+        "calibration_note": describe_errors(errors, known.rig) if found is None else found.words,
+        **({} if found is None else {"rig_errors": found.record}),
+        "camera_note": known.camera_note,
+        "components": {name: {"name": each.name, "key": each.key} for name, each in options.components.items()},
     }
 
 
-def camera_alone_record(known: KnownCapture, options: CorrectionOptions, unit: str) -> dict[str, Any]:
-    """Assumptions and estimates of the correction of one camera's frames, for JSON; ``unit``: of length."""
-    focal, best = known.focal, None if known.capture is None else known.capture.likeliest
+def _camera_record(known: KnownCapture, options: CorrectionOptions) -> dict[str, Any]:
+    focal = known.focal
     return {
-        "units": {"length": unit, "angle": "rad", "time": "frame period", "depth": f"{unit}, 0 = unknown"},
-        **_ideal_record(known.rig.camera),
         "focal_length_assumed": focal is not None and not focal.determined,
         "focal_length_estimated": focal is not None and focal.determined,
         "focal_length_sigma": None if focal is None else focal.sigma,
-        "scan": known.shutter.scan_of("left"),
-        "readout_ratio": known.shutter.readout_ratio,
-        "readout_ratio_sigma": None if best is None else best.sigma,
-        "readout_ratio_estimated": known.capture is not None,
-        "capture": None if known.capture is None else record_of(known.capture),
         "corrector": options.corrector.name,
-        "target_row": options.target_row,
-        "mask_values": {origin.name.lower(): value for origin, value in MASK_VALUES.items()},
         "gyro": known.gyro is not None,
         **({} if known.clock is None else {"gyro_clock": known.clock._asdict()}),
     }

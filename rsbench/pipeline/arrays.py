@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rsbench.capture.calibration import CardSigma
 from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.sequence_shutter import shutter_of_sequence
 from rsbench.capture.shutter_decision import NoMotionError
@@ -21,7 +20,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.correspondences import Correspondences, gyro_samples
 from rsbench.core.geometry import check_image, check_times, four_images
 from rsbench.core.rig import StereoRig
-from rsbench.core.shutter import RollingShutter, Scanning
+from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.chain import CorrectedFrames, Given, correct_four
 from rsbench.pipeline.footage import ImageSource, OneCameraCard
@@ -30,7 +29,7 @@ from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import model_to_use
 from rsbench.pipeline.isolated_chain import Isolation
 from rsbench.pipeline.mono_sequence import options_of_camera
-from rsbench.pipeline.sequence_capture import FEWEST_FRAMES, Gyroscope, know_capture, with_found_camera
+from rsbench.pipeline.sequence_capture import FEWEST_FRAMES, Gyroscope, know_capture
 from rsbench.pipeline.sequence_correction import correct_sequence
 from rsbench.solvers.engine.base import Solver, entry_of
 from rsbench.vision.corrector import demand_corrected, load_corrector
@@ -66,25 +65,20 @@ def options_of(
 def of_rig(
     images: Sequence[NDArray[Any]],
     rig: StereoRig,
-    readout_ratio: float | None,
+    inputs: KnownInputs,
     options: CorrectionOptions,
     gyro: ArrayLike | None = None,
     *,
-    sigma: CardSigma,
-    scanning: Scanning | None = None,
     close: bool = False,
 ) -> CorrectedFrames:
     """Four images left 0, right 0, left 1, right 1, corrected; errors as of ``rsbench.correct``.
 
-    ``sigma``: of the focal length and k1, which are estimated where it is not 0. ``close``: narrow holes too.
+    ``close``: narrow holes too.
     """
-    check_times(readout_ratio, options.target_row, rig)
+    check_times(inputs.readout_ratio, options.target_row, rig)
     views, known = four_images(images, rig), Given(gyro=gyro_samples(gyro))
     with Isolation() as isolation:
-        chain = isolation.chain(options)
-        inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning)
-        rig, _ = with_found_camera(rig, sigma, [views], chain, inputs)
-        found = correct_four(views, rig, readout_ratio, chain, given=known, scanning=scanning)
+        found = correct_four(views, rig, inputs, isolation.chain(options), given=known)
     demand_corrected(found.frames, options.corrector.name)
     if not close:
         return found

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, offset_error
+from rsbench.capture.calibration import NO_ERRORS, OFFSET
 from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.rig_calibration import FoundRig
 from rsbench.capture.two_frame_estimate import Capture
@@ -22,7 +22,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.frame_capture import KnownCapture, know_four
+from rsbench.pipeline.frame_capture import KnownCapture, know_four, with_found_camera
 from rsbench.pipeline.frame_depth import (
     CorrectionOptions,
     Images,
@@ -63,34 +63,47 @@ class CorrectedFrames:
     """Motion of the body that was used for the correction."""
     found: FoundMotion | None
     """The estimate of the motion; None if it was given."""
-    shutter: RollingShutter
-    capture: Capture | None
-    """The estimate of the shutter; None if it was given."""
+    known: KnownCapture
+    """Rig, shutter and calibration errors, given or estimated, and the estimates."""
     matches: Correspondences | None
     pairs: Pairs | None
     """The frames with the depth that was used for the correction."""
-    rig: StereoRig
-    """The cameras, including values that ``rsbench.correct`` estimated."""
-    rig_found: FoundRig | None
-    """The estimated errors of the rig's calibration; None if the rows of the frames agree with it."""
     frames: dict[View, Fused]
     """Corrected frames; each has a field that says whether its correction succeeded."""
     at_rows: list[dict[View, Fused]]
     """The frames corrected to each of the further target rows."""
     seconds: dict[str, float]
-    """Duration of each of ``STEPS``."""
+    """Duration of each of ``STEPS``; matching includes the estimate of the capture."""
+
+    @property
+    def rig(self) -> StereoRig:
+        """The cameras, including values that were estimated."""
+        return self.known.rig
+
+    @property
+    def shutter(self) -> RollingShutter:
+        """The shutter, given or estimated."""
+        return self.known.shutter
+
+    @property
+    def capture(self) -> Capture | None:
+        """The estimate of the shutter; None if it was given."""
+        return self.known.capture
+
+    @property
+    def rig_found(self) -> FoundRig | None:
+        """The estimated errors of the rig's calibration; None if the rows of the frames agree with it."""
+        return self.known.rig_found
 
 
 def correct_four(
     images: Images,
     rig: StereoRig,
-    readout_ratio: float | None,
+    inputs: KnownInputs,
     options: CorrectionOptions,
     step: Step = lambda word: None,
     given: Given | None = None,
     views: tuple[View, ...] = VIEWS,
-    disparity_offset: float | None = None,
-    scanning: Scanning | None = None,
     rows: Sequence[float] = (),
 ) -> CorrectedFrames:
     """Correct four frames (H, W[, 3]), uint8 or uint16, of a rig over one frame period.
@@ -98,15 +111,13 @@ def correct_four(
     Args:
         images: images by side and frame.
         rig: the rig, whose cameras have the images' size.
-        readout_ratio: readout ratio; None: it is estimated from the matches.
+        inputs: given values. A scanning that is not given is estimated with the readout ratio; if that is given,
+            both cameras read rows from the top at the same time. Calibration errors that are not given are
+            estimated if the row differences of the matches show some.
         options: the components, and options of the steps between them.
         step: called with the name of each of the 4 steps when it is done.
         given: further given values.
         views: the frames to correct.
-        disparity_offset: px by which disparities are too large, if the calibration is right otherwise; None:
-            calibration errors are estimated if the row differences of the matches show some.
-        scanning: scan of the cameras; None: it is estimated with the readout ratio, or, if that is given, both
-            cameras read rows from the top at the same time.
         rows: further target rows, to whose times the frames are corrected too.
 
     Raises:
@@ -115,30 +126,31 @@ def correct_four(
         NoMotionError: the matches do not determine a motion or readout ratio.
         ValueError: a motion is given without a readout ratio.
     """
-    given = given or Given()
-    check_cameras(rig, scanning or Scanning(), options, disparity_offset, given.pairs is not None)
-    if given.motion is not None and readout_ratio is None:
+    given, errors = given or Given(), inputs.calibration or NO_ERRORS
+    check_cameras(rig, inputs.reading, options, errors[OFFSET], given.pairs is not None)
+    if given.motion is not None and inputs.readout_ratio is None:
         raise ValueError("readout_ratio must be given with the motion: one estimated from matches may not fit it")
     clock, needs = _Clock(step), options.corrector.component.spec.needs
-    calibration = None if disparity_offset is None else offset_error(disparity_offset)
-    inputs = KnownInputs(readout_ratio=readout_ratio, scanning=scanning, calibration=calibration)
-    wanted, matches = given.motion is None and "motion" in needs, given.matches
-    if readout_ratio is not None and not wanted and (matches is not None or "matches" not in needs):
-        known = KnownCapture(rig=rig, shutter=inputs.shutter_of(rig), calibration=calibration or NO_ERRORS)
-        clock("matching")
+    wanted = given.motion is None and "motion" in needs
+    rig, note = with_found_camera(rig, [images], options, inputs)
+    if inputs.readout_ratio is not None and not wanted and (given.matches or "matches" not in needs):
+        shutter = inputs.shutter_of(rig)
+        known = KnownCapture(rig=rig, shutter=shutter, matches=given.matches, calibration=errors)
     else:
-        matches, known = know_four(images, rig, inputs, options, matches, clock)
-    found = solve_frames(matches, known, options) if wanted and matches is not None else None
+        known = know_four(images, rig, inputs, options, given.matches)
+    known = replace(known, camera_note=note)
+    clock("matching")
+    found = solve_frames(known, options) if wanted else None
     clock("motion")
     rig, shutter, offset = known.rig, known.shutter, known.calibration[OFFSET]
     if known.capture is not None:
-        check_cameras(rig, shutter.scanning, options, disparity_offset, given.pairs is not None)
+        check_cameras(rig, shutter.scanning, options, errors[OFFSET], given.pairs is not None)
     motion = given.motion if found is None else found.motion
     pairs = (
         find_depth(images, rig, shutter, motion, options, given.pairs, offset) if "depth" in needs else given.pairs
     )
     clock("depth")
-    given = replace(given, matches=matches, motion=motion, pairs=pairs)
+    given = replace(given, matches=known.matches, motion=motion, pairs=pairs)
     frames, *at_rows = correct_known_rows(
         images, given, rig, shutter, options, views, offset, (options.target_row, *rows)
     )
@@ -146,12 +158,9 @@ def correct_four(
     return CorrectedFrames(
         motion=motion,
         found=found,
-        shutter=shutter,
-        capture=known.capture,
-        matches=matches,
+        known=known,
+        matches=known.matches,
         pairs=pairs,
-        rig=rig,
-        rig_found=known.rig_found,
         frames=frames,
         at_rows=at_rows,
         seconds=clock.seconds,
@@ -162,7 +171,7 @@ def check_cameras(
     rig: StereoRig,
     scanning: Scanning,
     options: CorrectionOptions,
-    disparity_offset: float | None,
+    disparity_offset: float,
     depth_is_known: bool = False,
 ) -> None:
     """Check that the options support the cameras.
@@ -189,7 +198,7 @@ def check_cameras(
         )
 
 
-def _check_matcher(options: CorrectionOptions, disparity_offset: float | None) -> None:
+def _check_matcher(options: CorrectionOptions, disparity_offset: float) -> None:
     """Raise RsbenchError if the matcher needs a motion and there is none, or a disparity offset is given too."""
     if not needs_motion(options.matcher):
         return

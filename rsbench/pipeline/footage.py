@@ -147,12 +147,9 @@ class RigCard(StatedShutter):
         from rsbench.capture.hypotheses import KnownInputs  # slow to load, for a card that may be refused
 
         errors = None if self.disparity_offset is None else offset_error(self.disparity_offset)
-        return KnownInputs(readout_ratio=self.readout_ratio, scanning=self.scanning, calibration=errors)
-
-    @property
-    def sigma(self) -> CardSigma:
-        """Standard deviations of the intrinsics; 0 for a card with [left] and [right]."""
-        return CardSigma(focal=0.0, k1=0.0) if self.camera is None else self.camera.sigma
+        sigma = CardSigma() if self.camera is None else self.camera.sigma
+        ratio, scanning = self.readout_ratio, self.scanning
+        return KnownInputs(readout_ratio=ratio, scanning=scanning, calibration=errors, sigma=sigma)
 
     @property
     def _sizes(self) -> tuple[Size, Size]:

@@ -1,20 +1,22 @@
 """Estimate the capture of four frames of a rig: find or refuse matches, then estimate what is not given.
 
-``know_four`` and ``know_matches`` return a ``KnownCapture`` (rig, shutter, calibration errors). Motion, depth and
-corrected frames are then functions of frames, matches, this object and options.
+``know_four`` and ``know_matches`` return a ``KnownCapture`` (rig, shutter, calibration errors, matches). Motion,
+depth and corrected frames are then functions of frames, this object and options.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rsbench.capture.calibration import NO_ERRORS, RefusedFramesError, check_rig
 from rsbench.capture.hypotheses import MODELS, KnownInputs, scans_of
-from rsbench.capture.model_choice import AUTO
+from rsbench.capture.model_choice import compared_models
 from rsbench.capture.rig_calibration import (
     ERRORS,
     FoundRig,
@@ -25,13 +27,14 @@ from rsbench.capture.rig_calibration import (
     rows_moved,
     with_errors,
 )
-from rsbench.capture.self_calibration import FoundFocal
+from rsbench.capture.self_calibration import FoundCamera, FoundFocal, find_camera
 from rsbench.capture.shutter_decision import as_global, known_of, runs_backwards, shutter_found
 from rsbench.capture.two_frame_estimate import Capture, conclude, examine
 from rsbench.core.correspondences import Correspondences, without_lens
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.footage import Progress, no_progress
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.solvers.refined import RefinedSolver
 
@@ -40,8 +43,8 @@ if TYPE_CHECKING:  # what works on images is loaded where images are given, and 
     from rsbench.pipeline.mono_gyro import Clock
 
 BACKWARDS = (
-    "time runs backwards in them: the two times are exchanged, or lines are read from the side opposite to the "
-    "given one (`scan` in the rig's card)"
+    "time runs backwards in them: they are in the reverse order, or lines are read from the side opposite to the "
+    "given one (`scan` in the card)"
 )
 
 
@@ -52,6 +55,8 @@ class KnownCapture:
     rig: StereoRig
     """The cameras; for one camera ``StereoRig.of_one``."""
     shutter: RollingShutter
+    matches: Correspondences | None = None
+    """The matches of two frame times that are valid for the shutter; None for a sequence."""
     capture: Capture | None = None
     """The estimate of the shutter; None if it is given."""
     calibration: tuple[float, ...] = NO_ERRORS
@@ -76,14 +81,12 @@ def know_four(
     inputs: KnownInputs,
     options: CorrectionOptions,
     matches: Correspondences | None = None,
-    step: Callable[[str], None] = lambda word: None,
-) -> tuple[Correspondences, KnownCapture]:
+) -> KnownCapture:
     """Match four frames and estimate their capture, for ``solve_frames``.
 
     Args:
         inputs: given values; calibration errors of a rig that is not aligned are estimated by ``refine_rig``.
         matches: given matches, which are used unchanged; None: the frames are matched.
-        step: called with ``matching`` when there are matches.
 
     Raises:
         RefusedFramesError, NoMotionError: see ``match_frames`` and ``know_matches``.
@@ -91,11 +94,10 @@ def know_four(
 
     def known(
         matches: Correspondences, found: FoundRig | None, doubt: RefusedFramesError | None = None
-    ) -> tuple[Correspondences, KnownCapture]:
+    ) -> KnownCapture:
         right = rig if found is None else found.rig
         given = inputs if right.aligned else replace(inputs, calibration=inputs.calibration or NO_ERRORS)
-        matches, capture = know_matches(matches, right, given, options, doubt)
-        return matches, replace(capture, rig_found=found)
+        return replace(know_matches(matches, right, given, options, doubt), rig_found=found)
 
     from rsbench.vision.dense_matcher import forget_matches
 
@@ -104,7 +106,6 @@ def know_four(
     try:
         if matches is None:
             matches, doubt = match_given(images, rig, options, inputs)
-        step("matching")
         if check and doubt is None and not rig.aligned and inputs.calibration is None:
             found = rig_of_matches(matches, rig, inputs, options)
         return known(matches, found, doubt)
@@ -121,13 +122,13 @@ def know_matches(
     inputs: KnownInputs,
     options: CorrectionOptions,
     doubt: RefusedFramesError | None = None,
-) -> tuple[Correspondences, KnownCapture]:
-    """Estimate the capture from matches; returns the matches that are valid for it, and the capture.
+) -> KnownCapture:
+    """Estimate the capture from matches.
 
     Args:
         inputs: calibration errors that are not given are estimated if row differences of the matches show some; a
             scanning that is not given is estimated with the readout ratio, or rows from the top.
-        doubt: error that is raised if both cameras read rows at the same time, see ``match_unknown``.
+        doubt: error that is raised if both cameras read rows at the same time, see ``match_given``.
 
     Raises:
         RefusedFramesError: the frames are in reverse order.
@@ -135,16 +136,24 @@ def know_matches(
     """
     if inputs.readout_ratio is not None:
         models, errors = _calibrated(matches, rig, inputs, options)
-        return matches, KnownCapture(rig=rig, shutter=inputs.shutter_of(rig), calibration=errors, models=models)
+        shutter = inputs.shutter_of(rig)
+        return KnownCapture(rig=rig, shutter=shutter, matches=matches, calibration=errors, models=models)
     capture = find_capture(matches, rig, inputs, options)
-    if inputs.scanning is not None and runs_backwards(capture, scans_of(rig.shutter_of(inputs.scanning, 1.0))):
-        raise RefusedFramesError(BACKWARDS)
+    refuse_backwards(capture, rig, inputs.scanning)
     shutter, errors = shutter_found(capture, rig), NO_ERRORS
     if rig.rows_together(shutter.scanning):
         if doubt is not None:
             raise doubt
         matches, errors = on_their_rows(matches, rig), capture.calibration
-    return matches, KnownCapture(rig=rig, shutter=shutter, capture=capture, calibration=errors, models=capture)
+    return KnownCapture(
+        rig=rig, shutter=shutter, matches=matches, capture=capture, calibration=errors, models=capture
+    )
+
+
+def refuse_backwards(capture: Capture, rig: StereoRig, scanning: Scanning | None) -> None:
+    """Raise RefusedFramesError if lines are clearly read from the side opposite to a given scanning."""
+    if scanning is not None and runs_backwards(capture, scans_of(rig.shutter_of(scanning, 1.0))):
+        raise RefusedFramesError(BACKWARDS)
 
 
 def _calibrated(
@@ -153,7 +162,6 @@ def _calibrated(
     """Estimate calibration errors with a known shutter, if the matches show some; None: no estimate was made."""
     if inputs.calibration is not None or not rig.rows_together(inputs.reading):
         return None, inputs.calibration or NO_ERRORS
-    inputs = replace(inputs, scanning=inputs.reading)
     if not any(known_of(matches, rig, inputs).calibration_sigma):
         return None, NO_ERRORS
     capture = find_capture(matches, rig, inputs, options)
@@ -177,11 +185,6 @@ def capture_of(
     known = known_of(matches, rig, inputs)
     capture = conclude([examine(matches, rig, known, robust, seed)])
     return as_global(capture, [matches], rig, known) if inputs.readout_ratio is None else capture
-
-
-def compared_models(motion_model: str | None) -> tuple[str, ...]:
-    """The motion models to compare: all for ``auto`` or None, otherwise the requested one."""
-    return MODELS if motion_model in (None, AUTO) else (str(motion_model),)
 
 
 # Matches of the frames of a rig, and the correction of its calibration by them.
@@ -354,19 +357,17 @@ def _refined_rig(
 ) -> FoundRig | None:
     """``refine_rig`` with the given shutter, or with the one estimated for the rig with the errors ``start``."""
     inputs = replace(inputs, calibration=NO_ERRORS)
-    shutter = know_matches(matches, with_errors(rig, start), inputs, options)[1].shutter
+    shutter = know_matches(matches, with_errors(rig, start), inputs, options).shutter
     prior = prior_of(start)
     return refine_rig([matches], rig, shutter, start, prior, options.robust, options.seed, _model_name(options))
 
 
-def match_unknown(
-    images: Images, rig: StereoRig, options: CorrectionOptions, *, judge_rig: bool = True
+def match_given(
+    images: Images, rig: StereoRig, options: CorrectionOptions, inputs: KnownInputs, *, judge_rig: bool = True
 ) -> tuple[Correspondences, RefusedFramesError | None]:
-    """``match_frames`` for an unknown scan; also the error to raise if both cameras read rows at the same time.
-
-    Raises:
-        RefusedFramesError: the frames have no texture.
-    """
+    """``match_frames``; for an unknown scan also the error to raise if both cameras read rows at the same time."""
+    if inputs.readout_ratio is not None or inputs.scanning is not None:
+        return match_frames(images, rig, options, inputs.scanning, judge_rig=judge_rig), None
     doubt = None
     try:
         if judge_rig:
@@ -375,15 +376,6 @@ def match_unknown(
         doubt = error
     scanning = Scanning() if options.features.component.apart() is None else Scanning(scan="left")
     return _check_enough(find_matches_of_rig(images, rig, scanning, options)), doubt
-
-
-def match_given(
-    images: Images, rig: StereoRig, options: CorrectionOptions, inputs: KnownInputs, *, judge_rig: bool = True
-) -> tuple[Correspondences, RefusedFramesError | None]:
-    """``match_frames`` if readout ratio or scanning are given, otherwise ``match_unknown``; raises as these do."""
-    if inputs.readout_ratio is None and inputs.scanning is None:
-        return match_unknown(images, rig, options, judge_rig=judge_rig)
-    return match_frames(images, rig, options, inputs.scanning, judge_rig=judge_rig), None
 
 
 def on_their_rows(matches: Correspondences, rig: StereoRig) -> Correspondences:
@@ -406,3 +398,40 @@ def _check_enough(matches: Correspondences) -> Correspondences:
             "texture, or not the same scene"
         )
     return matches
+
+
+# The focal length and k1 of a rig whose card gives their standard deviations, from some of its frames.
+
+
+CAMERA_WINDOWS = 8
+"""Most windows, i.e. two successive frame times, for the focal length and k1."""
+
+
+def camera_of_frames(
+    windows: Iterable[Images], rig: StereoRig, options: CorrectionOptions, inputs: KnownInputs
+) -> FoundCamera:
+    """``find_camera`` from the matches of a few windows; windows without matches are skipped."""
+    matches = list[Correspondences]()
+    for images in islice(windows, CAMERA_WINDOWS):
+        with suppress(RefusedFramesError):  # the correction reports refused windows
+            matches.append(match_given(images, rig, options, inputs, judge_rig=False)[0])
+    if not matches:
+        return FoundCamera(rig=rig, sigma=inputs.sigma, determined=(False, False))
+    shutter = KnownInputs(readout_ratio=inputs.readout_ratio, scanning=inputs.scanning)
+    return find_camera(matches, rig, inputs.sigma, shutter, options.robust, options.seed)
+
+
+def with_found_camera(
+    rig: StereoRig,
+    windows: Iterable[Images],
+    options: CorrectionOptions,
+    inputs: KnownInputs,
+    progress: Progress = no_progress,
+) -> tuple[StereoRig, str]:
+    """The rig with focal length and k1 estimated if ``inputs.sigma`` is not 0, and a report on both."""
+    if not inputs.sigma:
+        return rig, ""
+    with progress("estimating the calibration", 1) as advance:
+        found = camera_of_frames(windows, rig, options, inputs)
+        advance("")
+    return found.rig, found.words(rig, inputs.sigma)

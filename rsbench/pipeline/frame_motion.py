@@ -11,9 +11,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rsbench.capture.calibration import NO_ERRORS, OFFSET, RefusedFramesError, recalibrated
+from rsbench.capture.calibration import RefusedFramesError, recalibrated
 from rsbench.capture.hypotheses import MODELS, Known, scans_of
-from rsbench.capture.model_choice import AUTO, ModelChoice, choose_model, spline_choice, spread_by_unknowns
+from rsbench.capture.model_choice import (
+    AUTO,
+    ModelChoice,
+    choose_model,
+    compared_models,
+    spline_choice,
+    spread_by_unknowns,
+)
 from rsbench.capture.rig_calibration import spread_of_motion
 from rsbench.capture.shutter_decision import LEAST_BACKWARDS, NoMotionError, reversed_scans, scans_by_laws
 from rsbench.capture.trajectory_gyro import GyroFound
@@ -28,7 +35,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.pipeline.frame_capture import BACKWARDS, KnownCapture, compared_models
+from rsbench.pipeline.frame_capture import BACKWARDS, KnownCapture
 from rsbench.pipeline.isolated_components import SolverRunner
 from rsbench.solvers.engine.base import MotionEstimate, SolverEntry, SolverSpec
 from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate, RobustOptions, estimate_motion
@@ -85,8 +92,6 @@ class FoundMotion:
     """Name of the solver's entry."""
     reference_point: str
     """The point whose translation ``robust.estimate.d`` is."""
-    calibration: tuple[float, ...] = NO_ERRORS
-    """Calibration errors that were removed from the matches, see ``calibration.TERMS``."""
     choice: ModelChoice | None = None
     """How the motion model was chosen; None if it is the solver's."""
     gyro: GyroFound | None = None
@@ -105,11 +110,6 @@ class FoundMotion:
         shifts = places - tau[:, None] * places[-1]
         turned, shifted = (float(np.sqrt(np.mean(np.sum(each**2, axis=1)))) for each in (turns, shifts))
         return turned, shifted
-
-    @property
-    def disparity_offset(self) -> float:
-        """Offset that was subtracted from the disparities, px."""
-        return self.calibration[OFFSET]
 
 
 def find_motion(
@@ -334,21 +334,19 @@ def motion_of(estimate: MotionEstimate, entry: SolverEntry, rig: StereoRig) -> M
     raise NoMotionError(f"solver {entry.name!r}: {motion}; a correction needs metres: use rs-stereo-refined")
 
 
-def solve_frames(
-    matches: Correspondences, known: KnownCapture, options: CorrectionOptions, *, in_order: bool = False
-) -> FoundMotion:
+def solve_frames(known: KnownCapture, options: CorrectionOptions, *, in_order: bool = False) -> FoundMotion:
     """Estimate the motion between two frame times with a known shutter and calibration.
 
     Args:
-        matches, known: as ``know_four`` and ``know_matches`` return them.
+        known: result of ``know_four`` or ``know_matches``, with matches.
         in_order: whether the frames are known to be in temporal order, and the shutter is not from them alone.
 
     Raises:
         RefusedFramesError: the frames are in reverse order.
         NoMotionError: no motion explains the matches.
     """
-    rig, shutter, errors = known.rig, known.shutter, known.calibration
-    corrected = recalibrated(matches, rig, errors)
+    rig, shutter = known.rig, known.shutter
+    corrected = recalibrated(known.matches or Correspondences(), rig, known.calibration)
     found = find_motion(corrected, rig, shutter, options, compared=known.models)
     if known.capture is None and not in_order and _runs_backwards(corrected, rig, found, shutter, options):
         raise RefusedFramesError(BACKWARDS)
@@ -361,7 +359,7 @@ def solve_frames(
         noise = estimate.noise_px or 0.0
         spread = spread_of_motion(known.rig_found, corrected, estimate.w, estimate.d, noise, model)
         found = replace(found, robust=widened(found.robust, spread))
-    return replace(found, calibration=errors)
+    return found
 
 
 def _runs_backwards(

@@ -24,10 +24,10 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.camera_capture import TOO_FEW
 from rsbench.pipeline.chain import inpainted
 from rsbench.pipeline.footage import check_alike
 from rsbench.pipeline.frame_depth import CorrectionOptions
-from rsbench.pipeline.mono_camera import TOO_FEW
 from rsbench.pipeline.mono_correction import (
     CUT,
     PIXELS,

@@ -14,10 +14,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import NO_ERRORS, CardSigma, RefusedFramesError, check_rig
+from rsbench.capture.calibration import NO_ERRORS, RefusedFramesError, check_rig
 from rsbench.capture.hypotheses import GLOBAL, Known, KnownInputs
+from rsbench.capture.model_choice import compared_models
 from rsbench.capture.rig_calibration import FoundRig
-from rsbench.capture.self_calibration import FoundCamera, find_camera
 from rsbench.capture.sequence_shutter import LONGEST, SUCCESSIVE, capture_of_sequence, shakes
 from rsbench.capture.shutter_decision import NoMotionError, as_global, known_of, shutter_found
 from rsbench.capture.trajectory_tracks import ENOUGH
@@ -29,19 +29,21 @@ from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
+from rsbench.pipeline.camera_capture import IN_ORDER, PAIRS, find_focal, find_shutter
 from rsbench.pipeline.footage import FrameSource, OneCameraCard, Progress, RigCard, check_alike, no_progress
 from rsbench.pipeline.frame_capture import (
+    CAMERA_WINDOWS,
     KnownCapture,
-    compared_models,
     find_rig,
     match_frames,
     match_given,
+    refuse_backwards,
     rig_of_matches,
     with_enough,
+    with_found_camera,
 )
 from rsbench.pipeline.frame_depth import CorrectionOptions, Images
 from rsbench.pipeline.frame_motion import FoundMotion
-from rsbench.pipeline.mono_camera import IN_ORDER, PAIRS, find_camera_alone, find_shutter
 from rsbench.pipeline.mono_correction import FoundOwnMotion
 from rsbench.pipeline.mono_gyro import PAIRS as CLOCK_PAIRS
 from rsbench.pipeline.mono_gyro import pair_rates, with_clock_corrected
@@ -107,7 +109,7 @@ def know_capture(
         return _know_camera(sources[0], card, options, gyro, progress)
     left, right = sources
     rig, inputs, shown = card.rig_of(next(iter(left)), next(iter(right))), card.inputs, spread_windows(left, right)
-    rig, note = with_found_camera(rig, card.sigma, shown, options, inputs, progress)
+    rig, note = with_found_camera(rig, shown, options, inputs, progress)
     turned = with_found_rig(rig, left, right, options, inputs)
     rig = rig if turned is None else turned.rig
     if not rig.aligned:  # its calibration errors are estimated by ``refine_rig``
@@ -150,26 +152,19 @@ def _know_camera(
     robust, seed, pairs = options.robust, options.seed, max(frames.count - 1, 1)
     unknown = card.readout_ratio is None
     with progress("estimating the shutter", min(pairs, LONGEST if unknown else IN_ORDER) + unknown) as advance:
-        found = find_shutter(frames, frames.count, card, robust, seed, advance, starts)
+        known = find_shutter(frames, frames.count, card, robust, seed, advance, starts)
         if unknown:
             advance("all pairs together")
-    shutter = found.shutter
-    wanted, words = card.focal_unknown and found.focal is None, "estimating the focal length"
-    with progress(words, min(pairs, PAIRS)) if wanted else no_progress("", 0) as advance:
-        camera, focal = find_camera_alone(frames, frames.count, card, shutter, robust, seed, advance, found.focal)
+    if card.focal_unknown and known.focal is None:
+        with progress("estimating the focal length", min(pairs, PAIRS)) as advance:
+            known = find_focal(frames, frames.count, card, known, robust, seed, advance)
+    camera, shutter = known.rig.camera, known.shutter
     samples, clock = None if gyro is None else gyro.samples, None
     if gyro is not None and gyro.clock_error > 0.0:
         with progress("estimating the gyroscope's clock", min(pairs, CLOCK_PAIRS)) as advance:
             rates = pair_rates(frames, frames.count, camera, shutter, robust, seed, advance, starts)
         samples, clock = with_clock_corrected(rates, gyro.samples, camera, shutter, gyro.clock_error)
-    return KnownCapture(
-        rig=StereoRig.of_one(camera),
-        shutter=shutter,
-        capture=found.capture,
-        focal=focal,
-        gyro=samples,
-        clock=clock,
-    )
+    return replace(known, gyro=samples, clock=clock)
 
 
 # Windows of a sequence of a rig, and refusals of windows.
@@ -248,12 +243,10 @@ def estimate_sequence_capture(
         advance: called after each window.
 
     Raises:
-        RefusedFramesError: the first windows contradict the given rig.
+        RefusedFramesError: the first windows contradict the given rig, or the frames are in reverse order.
         NoMotionError: the windows do not determine the shutter.
     """
     inputs = inputs or KnownInputs()
-    if inputs.readout_ratio is not None:
-        inputs = replace(inputs, scanning=inputs.reading)
 
     def under_global() -> Capture | None:
         still = replace(inputs, readout_ratio=0.0, scanning=Scanning())
@@ -283,6 +276,7 @@ def estimate_sequence_capture(
     capture = None if estimate.nothing_unknown else estimate.concluded()
     if capture is None or inputs.readout_ratio is not None:
         return capture, inputs.shutter_of(rig)
+    refuse_backwards(capture, rig, inputs.scanning)
     shutter, doubt = shutter_found(capture, rig), next(filter(None, doubts), None)
     if doubt is not None and rig.rows_together(shutter.scanning):
         raise doubt
@@ -373,57 +367,21 @@ def _narrowed(known: Known, capture: Capture) -> Known:
     return replace(known, scans=tuple(each for each in known.scans if each in left))
 
 
-# The focal length and k1 of a rig whose card gives their standard deviations, from some of its frames.
-
-
-_WINDOWS = 8
-"""Most windows for the focal length and k1."""
+# Estimates of a rig's calibration from some frames of a sequence.
 
 
 def spread_windows(left: FrameSource, right: FrameSource) -> Iterable[Images]:
     """Evenly spaced windows of a sequence."""
-    every = max((left.count - 1) // _WINDOWS, 1)
+    every = max((left.count - 1) // CAMERA_WINDOWS, 1)
     return islice(window_images(left, right), every // 2, None, every)
-
-
-def camera_of_frames(
-    windows: Iterable[Images], rig: StereoRig, sigma: CardSigma, options: CorrectionOptions, inputs: KnownInputs
-) -> FoundCamera:
-    """``find_camera`` from the matches of a few windows; windows without matches are skipped."""
-    matches = list[Correspondences]()
-    for images in islice(windows, _WINDOWS):
-        with suppress(RefusedFramesError):  # the correction reports refused windows
-            matches.append(match_given(images, rig, options, inputs, judge_rig=False)[0])
-    if not matches:
-        return FoundCamera(rig=rig, sigma=sigma, determined=(False, False))
-    shutter = KnownInputs(readout_ratio=inputs.readout_ratio, scanning=inputs.scanning)
-    return find_camera(matches, rig, sigma, shutter, options.robust, options.seed)
-
-
-def with_found_camera(
-    rig: StereoRig,
-    sigma: CardSigma,
-    windows: Iterable[Images],
-    options: CorrectionOptions,
-    inputs: KnownInputs,
-    progress: Progress = no_progress,
-) -> tuple[StereoRig, str]:
-    """The rig with focal length and k1 estimated if their ``sigma`` is not 0, and a report on both."""
-    if not sigma:
-        return rig, ""
-    with progress("estimating the calibration", 1) as advance:
-        found = camera_of_frames(windows, rig, sigma, options, inputs)
-        advance("")
-    return found.rig, found.words(rig, sigma)
 
 
 def with_found_rig(
     rig: StereoRig, left: FrameSource, right: FrameSource, options: CorrectionOptions, inputs: KnownInputs
 ) -> FoundRig | None:
     """Correct the rig's calibration by the first frames; None if their rows agree with it or are inconclusive."""
-    images = next(iter(window_images(left, right)), None)
-    together = rig.rows_together(inputs.reading, inputs.readout_ratio)
-    if images is None or (rig.aligned and not together):
+    images, together = next(window_images(left, right)), rig.rows_together(inputs.reading, inputs.readout_ratio)
+    if rig.aligned and not together:
         return None
     inputs = replace(inputs, calibration=None)
     try:
@@ -432,9 +390,6 @@ def with_found_rig(
             return None
         return rig_of_matches(match_frames(images, rig, options, inputs.scanning), rig, inputs, options)
     except RefusedFramesError as refusal:
-        if not together:
-            return None  # the correction reports refused windows
-        try:
-            return find_rig(images, rig, inputs, options, refusal)[0]
-        except (RefusedFramesError, NoMotionError):
-            return None  # the correction reports refused windows
+        with suppress(RefusedFramesError, NoMotionError):  # the correction reports refused windows
+            return find_rig(images, rig, inputs, options, refusal)[0] if together else None
+        return None

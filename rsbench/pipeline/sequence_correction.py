@@ -75,16 +75,16 @@ def on_one_trajectory(windows: Iterable[Window], known: KnownCapture, seed: int,
         seed: seed of the search for motions of single windows.
         solver: name that is recorded for the motions.
     """
-    waiting, rig, calibration = deque[Window](), known.rig, known.calibration
+    waiting, rig = deque[Window](), known.rig
 
     def matches() -> Iterator[Correspondences]:
         for window in windows:
             waiting.append(window)
-            yield recalibrated(window.matches or Correspondences(), rig, calibration)
+            yield recalibrated(window.matches or Correspondences(), rig, known.calibration)
 
     for streamed in stream_trajectory(matches(), rig, known.shutter, seed, gyro=known.gyro):
         window = waiting.popleft()
-        found = _found(streamed, solver, calibration)
+        found = _found(streamed, solver)
         reason = "" if streamed.supported else window.reason or BRIDGED
         pose = streamed.body_from_world
         if streamed.apart > _LONGEST_BRIDGE:
@@ -94,7 +94,7 @@ def on_one_trajectory(windows: Iterable[Window], known: KnownCapture, seed: int,
         yield replace(window, found=found, reason=reason, pose=pose)
 
 
-def _found(streamed: StreamedWindow, solver: str, calibration: tuple[float, ...]) -> FoundMotion:
+def _found(streamed: StreamedWindow, solver: str) -> FoundMotion:
     """The motion of a window of the trajectory in the form that a solver's answer has."""
     motion, right = streamed.motion, int(np.count_nonzero(streamed.inliers))
     estimate = MotionEstimate(
@@ -119,7 +119,6 @@ def _found(streamed: StreamedWindow, solver: str, calibration: tuple[float, ...]
         robust=robust,
         solver=solver,
         reference_point="body",
-        calibration=calibration,
         gyro=streamed.gyro,
     )
 
@@ -208,7 +207,7 @@ def _windows(
                 judged = number < JUDGED
                 matches = match_frames(images, known.rig, matching, known.shutter.scanning, judge_rig=judged)
                 if "motion" in needs and with_motion:
-                    found = solve_frames(matches, known, options, in_order=True)
+                    found = solve_frames(replace(known, matches=matches), options, in_order=True)
             except NoMotionError as error:
                 reason = str(error)
             except RefusedFramesError as error:
@@ -257,9 +256,8 @@ def _corrected_moment(
         frames = FRAMES if window.pose is None else (place,)
         pairs = find_depth(window.images, rig, shutter, motion, options, pairs, frames=frames)
     views = tuple((side, place) for side in SIDES)
-    offset = 0.0 if window.found is None else window.found.disparity_offset
     given = Given(matches=window.matches, motion=motion, pairs=pairs)
-    (fused,) = correct_known_rows(window.images, given, rig, shutter, options, views, offset)
+    (fused,) = correct_known_rows(window.images, given, rig, shutter, options, views, known.calibration[OFFSET])
     for (side, _), each in fused.items():
         if not each.success:
             why = f"{side}: {each.reason}"

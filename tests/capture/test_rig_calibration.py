@@ -159,8 +159,9 @@ def test_a_motion_is_stated_with_the_errors_of_the_calibration_that_was_found() 
         found = rig_of_matches(matches, given, GIVEN, OPTIONS)
         assert found is not None
         for counted in inside:
-            known = KnownCapture(rig=found.rig, shutter=found.shutter, rig_found=found if counted else None)
-            estimate = solve_frames(matches, known, OPTIONS, in_order=True).robust.estimate
+            errors = found if counted else None
+            known = KnownCapture(rig=found.rig, shutter=found.shutter, matches=matches, rig_found=errors)
+            estimate = solve_frames(known, OPTIONS, in_order=True).robust.estimate
             assert estimate.covariance is not None
             off = np.concatenate([estimate.w - motion.w, estimate.d - motion.d])
             inside[counted] += bool(off @ np.linalg.solve(estimate.covariance, off) < 12.59)  # chi-squared of 6

@@ -35,7 +35,6 @@ from rsbench.capture.shutter_decision import (
     known_alone,
     known_of,
     runs_backwards,
-    shutter_alone,
     shutter_found,
 )
 from rsbench.capture.two_frame_estimate import Candidate, Capture, conclude, examine, nearly_global
@@ -168,7 +167,7 @@ def test_frames_in_the_wrong_order_are_noticed() -> None:
         with pytest.raises(RefusedFramesError, match="backwards"):
             options = CorrectionOptions(motion_model=AUTO)
             inputs = KnownInputs(readout_ratio=ratio, scanning=TOP)
-            solve_frames(*know_matches(turned, RIG, inputs, options), options)
+            solve_frames(know_matches(turned, RIG, inputs, options), options)
 
 
 def test_a_disparity_offset_is_found_with_the_ratio() -> None:
@@ -209,7 +208,7 @@ def matches_of(model: str, seed: int = 0) -> Correspondences:
 def test_each_model_is_recognised_and_gives_the_right_d(model: str) -> None:
     """Among outliers; chi-squared with 6 degrees of freedom: beyond 22.5 in one of a thousand."""
     options = CorrectionOptions(motion_model=AUTO)
-    solved = solve_frames(*know_matches(matches_of(model), RIG, AT_TOP, options), options, in_order=True)
+    solved = solve_frames(know_matches(matches_of(model), RIG, AT_TOP, options), options, in_order=True)
     assert solved.choice is not None
     choice, found = solved.choice, solved.robust.estimate
     assert choice.used == model and sum(choice.probability.values()) == pytest.approx(1.0)
@@ -218,7 +217,7 @@ def test_each_model_is_recognised_and_gives_the_right_d(model: str) -> None:
     assert error @ np.linalg.solve(_known(found.covariance), error) < 22.5
     if model != "linear":
         options = CorrectionOptions()
-        linear = solve_frames(*know_matches(matches_of(model), RIG, AT_TOP, options), options, in_order=True)
+        linear = solve_frames(know_matches(matches_of(model), RIG, AT_TOP, options), options, in_order=True)
         assert np.linalg.norm(linear.motion.d - D) > 1.5 * np.sqrt(np.trace(_known(found.covariance)[3:, 3:]))
 
 
@@ -370,7 +369,7 @@ def test_a_turning_camera_shows_its_readout_whatever_the_unit_of_length() -> Non
     assert best is not None and best.scans.left == "top" and best.probability > 0.95
     # Its own deviation covers the error; 0.1 is what a correction asks for.
     assert abs(best.ratio - 0.7) < 3.0 * best.sigma and best.sigma < 0.1
-    assert shutter_alone(capture, CAMERA).readout_ratio == best.ratio
+    assert shutter_found(capture, StereoRig.of_one(CAMERA)).readout_ratio == best.ratio
 
 
 def test_exchanged_frames_look_read_from_the_other_side() -> None:
@@ -384,4 +383,4 @@ def test_exchanged_frames_look_read_from_the_other_side() -> None:
 def test_a_motion_along_the_lines_does_not_show_it() -> None:
     capture = _capture([_matches(LinearMotion(w=[0.0, 0.0, 0.0], d=[0.3, 0.0, 0.0]))])
     with pytest.raises(NoMotionError, match=r"cannot tell the readout ratio: the frames show .* read"):
-        shutter_alone(capture, CAMERA)
+        shutter_found(capture, StereoRig.of_one(CAMERA))

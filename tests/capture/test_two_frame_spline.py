@@ -181,11 +181,11 @@ def test_exchanged_times_of_a_rig_that_shakes_are_refused_and_right_ones_are_not
     for seed in range(3):
         rng = np.random.default_rng(seed)
         (window,), _ = matches(sines(rng, *SHAKES[shake]), 2, rng, noise=0.1, count=600)
-        found = solve_frames(*know_matches(window, RIG, GIVEN, OPTIONS), OPTIONS)
+        found = solve_frames(know_matches(window, RIG, GIVEN, OPTIONS), OPTIONS)
         assert found.motion.name == "continuous"  # and it was not refused
         exchanged = Correspondences(tracks=np.roll(window.tracks, 4, axis=1))
         with pytest.raises(RefusedFramesError, match="backwards"):
-            solve_frames(*know_matches(exchanged, RIG, GIVEN, OPTIONS), OPTIONS)
+            solve_frames(know_matches(exchanged, RIG, GIVEN, OPTIONS), OPTIONS)
 
 
 def test_where_the_laws_find_the_shutter_that_is_said_no_spline_makes_time_run_backwards(
@@ -194,7 +194,7 @@ def test_where_the_laws_find_the_shutter_that_is_said_no_spline_makes_time_run_b
     """Matches among trees err together: a spline may be preferred to the law, and the opposite one to it."""
     rng = np.random.default_rng(0)
     (window,), _ = matches(sines(rng, *SHAKES["strong"]), 2, rng, noise=0.1, count=100)
-    spline = solve_frames(*know_matches(window, RIG, GIVEN, OPTIONS), OPTIONS)
+    spline = solve_frames(know_matches(window, RIG, GIVEN, OPTIONS), OPTIONS)
     motion = make_motion("accelerated", 0.05 * rng.normal(size=3), 0.2 * rng.normal(size=3), {"acceleration": 0.3})
     data = simulate(RIG, SHUTTER, motion, SimulationOptions(tracks=300, noise_px=0.3), rng).correspondences
     exchanged = Correspondences(tracks=np.roll(data.tracks, 4, axis=1))
@@ -211,7 +211,7 @@ def test_a_readout_ratio_of_two_shaken_frames_is_not_told() -> None:
         rng = np.random.default_rng(seed)
         (window,), _ = matches(sines(rng, *SHAKES["strong"]), 2, rng, noise=0.1, count=400)
         with pytest.raises(NoMotionError, match="cannot tell"):
-            solve_frames(*know_matches(window, RIG, KnownInputs(), OPTIONS), OPTIONS)
+            solve_frames(know_matches(window, RIG, KnownInputs(), OPTIONS), OPTIONS)
         problem = Problem(name="", correspondences=window, rig=RIG, known_shutter=None)
         with SolverRunner() as runner:
             answer = solve_problem(problem, OPTIONS.solver, OPTIONS.robust, runner, motion_model="auto")

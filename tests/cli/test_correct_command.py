@@ -28,6 +28,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.dataset import corrected_frames
 from rsbench.dataset.corrected_frames import MASK_VALUES
 from rsbench.dataset.sequence import Sequence
+from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.storage.files import read_depth, read_png, write_png
 
 ORDER = ("left_0", "right_0", "left_1", "right_1")
@@ -332,6 +333,7 @@ def test_one_window_of_a_rig_that_is_off_says_how_far_it_errs() -> None:
     matches = simulate(rig, shutter, motion, options, np.random.default_rng(0)).correspondences
     known = Known(scans=(Scans("top", "top"),), delay=0.0, models=("linear",))
     window = examine(matches, rig, replace(known, calibration_sigma=offset_error(0.5)))
-    assert "may err" in readout_words(shutter, conclude([window]), rig)
-    assert "may err" not in readout_words(shutter, conclude([window, window]), rig)
-    assert "may err" not in readout_words(shutter, conclude([examine(matches, rig, known)]), rig)
+    taken = KnownCapture(rig=rig, shutter=shutter)
+    assert "may err" in readout_words(replace(taken, capture=conclude([window])))
+    assert "may err" not in readout_words(replace(taken, capture=conclude([window, window])))
+    assert "may err" not in readout_words(replace(taken, capture=conclude([examine(matches, rig, known)])))

@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 from rsbench.core.rig import SIDES, Side
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
-from rsbench.dataset.corrected_frames import join_poses, rig_record, write_frame, write_poses, write_record
+from rsbench.dataset.corrected_frames import capture_record, join_poses, write_frame, write_poses, write_record
 from rsbench.dataset.sequence import Sequence
 from rsbench.interop.readers.layouts import read_colmap
 from rsbench.interop.writers.colmap_and_tum import read_corrected_folder
+from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.storage.files import read_json, write_json, write_png
 from rsbench.storage.work_folder import HIDDEN, remove
@@ -51,7 +52,7 @@ def _corrected(data: Path, out: Path, row: int = 0, rows: bool = False) -> Seque
     join_poses(out, "row_poses")
     remove(out / HIDDEN)
     options = CorrectionOptions(target_row=float(row))
-    write_record(out, {**rig_record(sequence.rig, shutter, None, options), "frames": []})
+    write_record(out, {**capture_record(KnownCapture(rig=sequence.rig, shutter=shutter), options), "frames": []})
     return sequence
 
 
@@ -99,7 +100,9 @@ def test_evo_reads_the_cameras_of_a_corrected_sequence(tmp_path: Path, data: Pat
 def test_the_record_of_a_rig_is_read_to_the_bit(tmp_path: Path, name: str) -> None:
     rig = RIGS[name]
     shutter = rig.shutter_of(SCANS["late"], 0.8)
-    write_record(tmp_path, {**rig_record(rig, shutter, None, CorrectionOptions()), "frames": []})
+    write_record(
+        tmp_path, {**capture_record(KnownCapture(rig=rig, shutter=shutter), CorrectionOptions()), "frames": []}
+    )
     write_poses(tmp_path, "trajectory", 0, [0.0, 1.0], Pose(np.stack([np.eye(3)] * 2), np.zeros((2, 3))))
     join_poses(tmp_path, "trajectory")
     found = read_corrected_folder(tmp_path)

@@ -14,7 +14,7 @@ from rsbench.core.correspondences import Correspondences
 from rsbench.core.pose_errors import translation_of_offset
 from rsbench.core.rig import SIDES, Side
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline.one_camera import global_shutter_motion, monocular_motion, solved_alone
+from rsbench.pipeline.baseline_motions import global_shutter_motion, monocular_motion, solved_alone
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 
@@ -83,7 +83,7 @@ def test_the_callers_options_reach_the_loop(monkeypatch: pytest.MonkeyPatch) -> 
         seen.append(arguments[4])
         return estimate_motion(*arguments)
 
-    monkeypatch.setattr("rsbench.pipeline.one_camera.estimate_motion", spy)
+    monkeypatch.setattr("rsbench.pipeline.baseline_motions.estimate_motion", spy)
     asked = RobustOptions(threshold_px=1.0, adapt_threshold=False, confidence=0.9, lo_steps=1, max_iterations=77)
     c = Correspondences(tracks=np.random.default_rng(0).uniform(0, 899, (20, 8)))
     global_shutter_motion(c, RIG, asked, np.random.default_rng(0))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from commands import refused
 
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.plugins import wrap
 from rsbench.core import so3
@@ -63,7 +64,7 @@ KINDS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def test_frames_of_every_kind_are_corrected(castle: Sequence, kind: str) -> None:
     like = KINDS[kind]
     images = {view: like(image) for view, image in _frames(castle).items()}
-    result = correct_four(images, castle.rig, castle.shutter.readout_ratio, CorrectionOptions())
+    result = correct_four(images, castle.rig, KnownInputs.of(castle.shutter), CorrectionOptions())
     for view, fused in result.frames.items():
         assert fused.image.dtype == images[view].dtype and fused.image.shape == images[view].shape
         assert np.mean(fused.origin == Origin.HERE) > 0.8
@@ -82,9 +83,9 @@ def test_other_sizes_and_borders(castle: Sequence) -> None:
     c = castle.rig.camera
     camera = type(c)(width=width, height=height, fx=c.fx, fy=c.fy, cx=c.cx - left + border, cy=c.cy - top + border)
     # Rows are read at the same speed, so the ratio belongs to the new height.
-    ratio = castle.shutter.readout_ratio * height / c.height
+    inputs = KnownInputs(readout_ratio=castle.shutter.readout_ratio * height / c.height)
     result = correct_four(
-        images, StereoRig(camera=camera, baseline=castle.rig.baseline), ratio, CorrectionOptions()
+        images, StereoRig(camera=camera, baseline=castle.rig.baseline), inputs, CorrectionOptions()
     )
     inner = np.zeros((height, width), dtype=bool)
     inner[2 * border : -2 * border, 2 * border : -2 * border] = True
@@ -101,7 +102,7 @@ def test_the_last_row_stays_where_it_is_when_it_is_the_target(castle: Sequence) 
     height = castle.rig.camera.height
     for row in (0, height - 1):
         options = CorrectionOptions(target_row=float(row))
-        result = correct_four(images, castle.rig, castle.shutter.readout_ratio, options)
+        result = correct_four(images, castle.rig, KnownInputs.of(castle.shutter), options)
         for view, fused in result.frames.items():
             seen = fused.origin[row] == Origin.HERE
             assert np.mean(seen) > 0.8
@@ -115,14 +116,14 @@ def test_a_global_shutter_leaves_the_frames_as_they_are(castle: Sequence) -> Non
     1e-5 of a frame period moves a pixel by at most 1e-3 px: a grey level, and no pixel leaves the picture. At
     1e-3 it is 0.1 px, still less than half a pixel.
     """
-    images = _frames(castle)
-    first = correct_four(images, castle.rig, 0.0, CorrectionOptions(), given=Given(motion=castle.motion))
+    images, moved = _frames(castle), Given(motion=castle.motion)
+    first = correct_four(images, castle.rig, KnownInputs(readout_ratio=0.0), CorrectionOptions(), given=moved)
     for view in VIEWS:
         assert np.array_equal(first.frames[view].image, images[view])
         assert np.all(first.frames[view].origin == Origin.HERE)
     for ratio in (1e-5, 1e-3):
         given = Given(motion=castle.motion, pairs=first.pairs)
-        near = correct_four(images, castle.rig, ratio, CorrectionOptions(), given=given)
+        near = correct_four(images, castle.rig, KnownInputs(readout_ratio=ratio), CorrectionOptions(), given=given)
         for view in VIEWS:
             assert np.all(near.frames[view].origin == Origin.HERE)
             apart = np.abs(near.frames[view].image.astype(int) - images[view])
@@ -130,9 +131,9 @@ def test_a_global_shutter_leaves_the_frames_as_they_are(castle: Sequence) -> Non
 
 
 def test_inpainting_leaves_no_pixel_empty_and_keeps_the_marks(castle: Sequence) -> None:
-    images, ratio = _frames(castle), castle.shutter.readout_ratio
-    plain = correct_four(images, castle.rig, ratio, CorrectionOptions()).frames
-    painted = correct_four(images, castle.rig, ratio, CorrectionOptions(inpaint=True)).frames
+    images, inputs = _frames(castle), KnownInputs.of(castle.shutter)
+    plain = correct_four(images, castle.rig, inputs, CorrectionOptions()).frames
+    painted = correct_four(images, castle.rig, inputs, CorrectionOptions(inpaint=True)).frames
     for view in VIEWS:
         np.testing.assert_array_equal(plain[view].origin, painted[view].origin)
         known = plain[view].origin != Origin.NOBODY
@@ -144,7 +145,7 @@ def test_any_metric_solver_corrects_in_its_own_model(castle: Sequence, name: str
     """Other solvers, of another motion model than the data's; the shutter's direction is still judged by ours."""
     images = _frames(castle)
     entry = load_solver_entry(name)
-    result = correct_four(images, castle.rig, castle.shutter.readout_ratio, CorrectionOptions(solver=entry))
+    result = correct_four(images, castle.rig, KnownInputs.of(castle.shutter), CorrectionOptions(solver=entry))
     assert result.motion is not None and result.motion.name == entry.solver.spec.motion_model
     assert result.found is not None and result.found.solver == name
     # Ours gains 6 dB; theirs are a tenth of a degree off, which is a quarter of a pixel here.
@@ -153,14 +154,14 @@ def test_any_metric_solver_corrects_in_its_own_model(castle: Sequence, name: str
 
 def test_a_left_cameras_metric_answer_is_moved_to_the_body(castle: Sequence) -> None:
     """A solver that answers the true motion of the left camera corrects like the true motion of the body."""
-    images, ratio = _frames(castle), castle.shutter.readout_ratio
+    images, inputs, options = _frames(castle), KnownInputs.of(castle.shutter), CorrectionOptions()
     offset = castle.rig.offset("left")
     w, d = castle.motion.w, castle.motion.d
     of_left = MotionEstimate(w=w, d=d + offset - so3.exp(w) @ offset, success=True, metric=True)
     motion = motion_of(of_left, load_solver_entry("gs-8pt"), castle.rig)
     np.testing.assert_allclose(motion.d, d, atol=1e-15)
-    found = correct_four(images, castle.rig, ratio, CorrectionOptions(), given=Given(motion=motion))
-    true = correct_four(images, castle.rig, ratio, CorrectionOptions(), given=Given(motion=castle.motion))
+    found = correct_four(images, castle.rig, inputs, options, given=Given(motion=motion))
+    true = correct_four(images, castle.rig, inputs, options, given=Given(motion=castle.motion))
     for view in VIEWS:
         difference = found.frames[view].image.astype(int) - true.frames[view].image
         assert np.quantile(np.abs(difference), 0.99) <= 1  # the last digit of a motion may round a grey level
@@ -168,8 +169,8 @@ def test_a_left_cameras_metric_answer_is_moved_to_the_body(castle: Sequence) -> 
 
 def test_what_is_given_is_not_looked_for(castle: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
     """The chain from its own results gives the same frames, with no matcher and no solver called."""
-    images, ratio, options = _frames(castle), castle.shutter.readout_ratio, CorrectionOptions()
-    first = correct_four(images, castle.rig, ratio, options)
+    images, inputs, options = _frames(castle), KnownInputs.of(castle.shutter), CorrectionOptions()
+    first = correct_four(images, castle.rig, inputs, options)
 
     def never(*_: object) -> None:
         raise AssertionError("not needed")
@@ -177,21 +178,21 @@ def test_what_is_given_is_not_looked_for(castle: Sequence, monkeypatch: pytest.M
     for name in ("chain.know_four", "chain.solve_frames", "frame_motion.estimate_motion", "chain.frame_pairs"):
         monkeypatch.setattr(f"rsbench.pipeline.{name}", never)
     given = Given(matches=first.matches, motion=first.motion, pairs=first.pairs)
-    again = correct_four(images, castle.rig, ratio, options, given=given, views=(("right", 1),))
+    again = correct_four(images, castle.rig, inputs, options, given=given, views=(("right", 1),))
     assert list(again.frames) == [("right", 1)] and again.found is None
     np.testing.assert_array_equal(again.frames["right", 1].image, first.frames["right", 1].image)
     with pytest.raises(ValueError, match="readout_ratio"):
-        correct_four(images, castle.rig, None, options, given=given)
+        correct_four(images, castle.rig, KnownInputs(), options, given=given)
 
 
 def test_a_corrector_gets_what_it_needs_and_no_more(castle: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rotation alone needs no depth; a corrector that needs nothing works where there is no motion to find."""
-    images, ratio = _frames(castle), castle.shutter.readout_ratio
-    turned = correct_four(images, castle.rig, ratio, CorrectionOptions(corrector=load_corrector("rotation-only")))
+    images, inputs = _frames(castle), KnownInputs.of(castle.shutter)
+    turned = correct_four(images, castle.rig, inputs, CorrectionOptions(corrector=load_corrector("rotation-only")))
     assert turned.motion is not None and turned.pairs is None
     flat = {view: np.full_like(image, 128) for view, image in images.items()}
     options = CorrectionOptions(corrector=wrap(CORRECTORS, Nothing()))
-    still = correct_four(flat, castle.rig, ratio, options)
+    still = correct_four(flat, castle.rig, inputs, options)
     assert still.motion is None and still.matches is None and still.pairs is None
     for view in VIEWS:
         np.testing.assert_array_equal(still.frames[view].image, flat[view])
@@ -225,7 +226,7 @@ def test_equal_keys_mean_equal_options() -> None:
 def test_an_unknown_readout_ratio_is_estimated_or_declared_open(castle: Sequence) -> None:
     """The small frames do not determine it well: the answer is near the truth by its own uncertainty, or none."""
     try:
-        result = correct_four(_frames(castle), castle.rig, None, CorrectionOptions())
+        result = correct_four(_frames(castle), castle.rig, KnownInputs(), CorrectionOptions())
     except NoMotionError as refusal:
         assert "readout_ratio" in str(refusal)
     else:
@@ -245,7 +246,9 @@ WRONG: dict[str, Callable[[Images], Images]] = {
 @pytest.mark.parametrize("words", WRONG)
 def test_wrong_frames_are_refused(words: str, castle: Sequence) -> None:
     with refused(words):
-        correct_four(WRONG[words](_frames(castle)), castle.rig, 0.8, CorrectionOptions())
+        correct_four(
+            WRONG[words](_frames(castle)), castle.rig, KnownInputs.of(castle.shutter), CorrectionOptions()
+        )
 
 
 @dataclass(frozen=True)
@@ -266,15 +269,14 @@ def test_features_without_stereo_matches_are_no_sign_of_wrong_frames(castle: Seq
         match_frames(WRONG["exchanged"](images), castle.rig, options)
     few = CorrectionOptions(features=options.features, solver=load_solver_entry("gs-stereo-tracks"))
     with pytest.raises(NoMotionError, match="tracks"):
-        correct_four(images, castle.rig, castle.shutter.readout_ratio, few)
+        correct_four(images, castle.rig, KnownInputs.of(castle.shutter), few)
 
 
 def test_matches_without_a_motion_say_why(castle: Sequence) -> None:
     rng = np.random.default_rng(0)
     noise = Correspondences(left=rng.uniform(0, 90, (8, 4)), right=rng.uniform(0, 90, (8, 4)))
     with pytest.raises(NoMotionError, match="found no motion: "):
-        known = KnownCapture(rig=castle.rig, shutter=castle.shutter)
-        solve_frames(noise, known, CorrectionOptions())
+        solve_frames(KnownCapture(rig=castle.rig, shutter=castle.shutter, matches=noise), CorrectionOptions())
 
 
 def test_sixteen_bits_use_one_factor_for_all() -> None:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
@@ -105,9 +106,9 @@ def _known(castle: Sequence) -> KnownCapture:
 
 
 def test_a_sequence_of_two_equals_four_frames(folders: Folders, castle: Sequence) -> None:
-    options, ratio = CorrectionOptions(), castle.shutter.readout_ratio
+    options, inputs = CorrectionOptions(), KnownInputs.of(castle.shutter)
     moments = list(correct_sequence(folders, _known(castle), options))
-    four = correct_four({view: castle.image("rs", *view) for view in VIEWS}, castle.rig, ratio, options).frames
+    four = correct_four({view: castle.image("rs", *view) for view in VIEWS}, castle.rig, inputs, options).frames
     assert [moment.number for moment in moments] == [0, 1]
     for moment in moments:
         for side, fused in moment.frames.items():
@@ -149,7 +150,7 @@ def test_a_frame_without_motion_to_the_next_uses_the_motion_that_led_to_it(
     four = correct_four(
         {view: castle.image("rs", *view) for view in VIEWS},
         castle.rig,
-        castle.shutter.readout_ratio,
+        KnownInputs.of(castle.shutter),
         CorrectionOptions(),
     ).frames
     np.testing.assert_array_equal(moments[1].frames["left"].image, four["left", 1].image)

@@ -15,7 +15,7 @@ from rsbench.core.geometry import FixedGeometry
 from rsbench.core.projection import rs_project
 from rsbench.core.rig import VIEWS, StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.pipeline.one_camera import ZhuangCorrector
+from rsbench.pipeline.baseline_motions import ZhuangCorrector
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.correction import correction_flow
 from rsbench.vision.corrector import CORRECTORS, CorrectionProblem, find_corrected

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.components.motion_models import LinearMotion
 from rsbench.components.plugins import wrap
 from rsbench.core import so3
@@ -238,12 +239,12 @@ def test_too_few_samples_are_a_failure_by_value(world: Build, count: int) -> Non
 def test_the_chain_hands_samples_over_and_says_where_they_are_missing(world: Build) -> None:
     scene = world((), sky=True)
     images, options = problem_of(scene).images, CorrectionOptions(corrector=load_corrector("gyro"))
-    ratio = scene.shutter.readout_ratio
-    found = correct_four(images, scene.rig, ratio, options, given=Given(gyro=rates(scene)))
+    inputs = KnownInputs.of(scene.shutter)
+    found = correct_four(images, scene.rig, inputs, options, given=Given(gyro=rates(scene)))
     assert found.matches is None and found.pairs is None
     assert all(fused.success for fused in found.frames.values())
     with pytest.raises(RsbenchError, match="corrector 'gyro': needs the samples of a gyroscope"):
-        correct_four(images, scene.rig, ratio, options)
+        correct_four(images, scene.rig, inputs, options)
 
 
 # One image

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rsbench.benchmark.images.plan import NONE, HashOf, Places, Plan, Recipe, reference_of
 from rsbench.benchmark.images.store import Artefact, read_record
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.components.seeds import generator
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
@@ -215,10 +216,9 @@ class Bench:
             artefact.finish(record | {"success": False, "reason": given})
             return
         images, start = self.images, time.perf_counter()
-        ratio = self.sequence.shutter.readout_ratio
+        inputs = KnownInputs.of(self.sequence.shutter)
         try:
-            scanning = self.sequence.shutter.scanning
-            found = correct_four(images, self.sequence.rig, ratio, recipe.chain, given=given, scanning=scanning)
+            found = correct_four(images, self.sequence.rig, inputs, recipe.chain, given=given)
             frames = found.frames
         except RsbenchError as error:
             artefact.finish(record | {"success": False, "reason": str(error)})

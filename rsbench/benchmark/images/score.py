@@ -20,6 +20,7 @@ from rsbench.benchmark.images.predict import depth_of, load_disparities, true_pa
 from rsbench.benchmark.images.store import Artefact, identity_of, keep, kept, read_seconds
 from rsbench.benchmark.provenance import numeric_version, package_version
 from rsbench.benchmark.scoring import Case, DepthCase, ImageCase, PoseCase, answered, score
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.components.imports import hash_of_files
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, Side, View
@@ -299,6 +300,6 @@ def visible_pixels(
     images = {(side, frame): pairs[frame].images[side] for side, frame in VIEWS}
     given = Given(motion=sequence.motion, pairs=pairs)
     options = CorrectionOptions(corrector=load_corrector(_SEES), depth_from_motion=False, target_row=target_row)
-    ratio, scanning = sequence.shutter.readout_ratio, sequence.shutter.scanning
-    found = correct_four(images, sequence.rig, ratio, options, given=given, views=views, scanning=scanning)
+    inputs = KnownInputs.of(sequence.shutter)
+    found = correct_four(images, sequence.rig, inputs, options, given=given, views=views)
     return {view: fused.origin == Origin.HERE for view, fused in found.frames.items()}

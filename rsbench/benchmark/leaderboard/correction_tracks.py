@@ -36,6 +36,7 @@ from rsbench.benchmark.leaderboard.pictures import (
 from rsbench.benchmark.leaderboard.pictures import columns as parting_columns
 from rsbench.benchmark.leaderboard.splits import Frames
 from rsbench.benchmark.leaderboard.track import FAILED, ORACLE, SECONDS, Numbers, Score, Submission, Track
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import FRAMES, VIEWS, View
@@ -125,8 +126,8 @@ def _best(pictures: TruePictures, place: Path) -> None:
     given = Given(motion=sequence.motion, pairs=true_pairs(sequence, images))
     for each in pictures.requested:
         options = CorrectionOptions(target_row=each.row)
-        ratio = sequence.shutter.readout_ratio
-        fused = correct_four(images, sequence.rig, ratio, options, given=given, views=(VIEW,)).frames[VIEW]
+        inputs = KnownInputs.of(sequence.shutter)
+        fused = correct_four(images, sequence.rig, inputs, options, given=given, views=(VIEW,)).frames[VIEW]
         write_bytes(place / f"{each.stem}.png", frame_png(fused.image, fused.origin != 0))
 
 
@@ -228,11 +229,10 @@ class CorrectionTrack(PictureTrack):
         found = correct_four(
             work.images,
             rig,
-            shutter.readout_ratio,
+            KnownInputs.of(shutter),
             replace(chain, target_row=first),
             given=work.known,
             views=(VIEW,),
-            scanning=shutter.scanning,
             rows=others,
         )
         _share(work, found)

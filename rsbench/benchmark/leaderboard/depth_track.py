@@ -165,8 +165,7 @@ def _motion(work: SharedWork, chain: CorrectionOptions) -> Motion:
     if work.known.motion is None:
         matches = match_frames(work.images, rig, chain, shutter.scanning)
         matched = time.perf_counter()
-        given = KnownInputs(readout_ratio=shutter.readout_ratio, scanning=shutter.scanning)
-        found = solve_frames(*know_matches(matches, rig, given, chain), chain)
+        found = solve_frames(know_matches(matches, rig, KnownInputs.of(shutter), chain), chain)
         work.known = Given(motion=found.motion)
         work.spent = {"matching": matched - start, "motion": time.perf_counter() - matched}
     assert work.known.motion is not None

@@ -16,6 +16,7 @@ from rsbench.benchmark.images.predict import true_pairs
 from rsbench.benchmark.images.store import identity_of
 from rsbench.benchmark.provenance import numeric_version
 from rsbench.benchmark.scoring import motion_errors
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.capture.shutter_decision import NoMotionError
 from rsbench.components.imports import hash_of_files
 from rsbench.components.seeds import generator
@@ -25,12 +26,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import FRAMES, SIDES, VIEWS, Side, View
 from rsbench.dataset.clock_channels import gyro_samples
 from rsbench.dataset.sequence import Sequence
-from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
-from rsbench.pipeline.frame_capture import find_matches
-from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs, frame_pairs, known_depth
-from rsbench.pipeline.frame_motion import FoundMotion, find_motion, model_to_use
-from rsbench.pipeline.layered_scene import LayersCorrector
-from rsbench.pipeline.one_camera import (
+from rsbench.pipeline.baseline_motions import (
     ZhuangCorrector,
     depth_alone,
     global_shutter_motion,
@@ -38,6 +34,11 @@ from rsbench.pipeline.one_camera import (
     monocular_motion,
     solved_alone,
 )
+from rsbench.pipeline.chain import Given, correct_four, correct_frames, uncorrected
+from rsbench.pipeline.frame_capture import find_matches
+from rsbench.pipeline.frame_depth import CorrectionOptions, Pairs, frame_pairs, known_depth
+from rsbench.pipeline.frame_motion import FoundMotion, find_motion, model_to_use
+from rsbench.pipeline.layered_scene import LayersCorrector
 from rsbench.solvers.engine.base import load_solver_entry
 from rsbench.storage.files import sha256
 from rsbench.vision.correction import correction_flow
@@ -279,8 +280,8 @@ class Bench:
             self.options, corrector=load_corrector(corrector), depth_from_motion=corrector == "fusion"
         )
         given = Given(matches=self.matches, motion=motion, pairs=pairs)
-        ratio = self.shutter.readout_ratio
-        result = correct_four(self.images, self.rig, ratio, options, given=given, views=views)
+        inputs = KnownInputs.of(self.shutter)
+        result = correct_four(self.images, self.rig, inputs, options, given=given, views=views)
         return result.frames, result.pairs or pairs
 
     def _nothing(self) -> dict[View, Attempt]:

@@ -10,6 +10,8 @@ import pytest
 from evaluations import evaluate
 
 from rsbench.benchmark.images.evaluation import read_scores
+from rsbench.capture.calibration import offset_error
+from rsbench.capture.hypotheses import KnownInputs
 from rsbench.components.plugins import wrap
 from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS, View
@@ -81,10 +83,10 @@ def test_without_a_motion_the_matcher_is_refused_by_name(smoke_dataset: Path) ->
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     options = CorrectionOptions(matcher=load_matcher("sweep"), corrector=wrap(CORRECTORS, _Still()))
     with pytest.raises(RsbenchError, match="matcher 'sweep': needs the rig's motion, and corrector"):
-        correct_four(images, sequence.rig, 0.8, options)
+        correct_four(images, sequence.rig, KnownInputs(readout_ratio=0.8), options)
     options = CorrectionOptions(matcher=load_matcher("sweep"))
     with pytest.raises(RsbenchError, match=r"disparity_offset = 0\.5: must be 0 with matcher 'sweep'"):
-        correct_four(images, sequence.rig, 0.8, options, disparity_offset=0.5)
+        correct_four(images, sequence.rig, KnownInputs(readout_ratio=0.8, calibration=offset_error(0.5)), options)
 
 
 def test_the_true_motion_gives_depth_in_each_lines_own_camera(smoke_dataset: Path) -> None:
@@ -92,7 +94,7 @@ def test_the_true_motion_gives_depth_in_each_lines_own_camera(smoke_dataset: Pat
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     options = CorrectionOptions(matcher=load_matcher("sweep"), find_sky=False, depth_from_motion=False)
     given = Given(motion=sequence.motion)
-    found = correct_four(images, sequence.rig, sequence.shutter.readout_ratio, options, given=given, views=())
+    found = correct_four(images, sequence.rig, KnownInputs(readout_ratio=0.8), options, given=given, views=())
     assert found.pairs is not None and all(pair.timed for pair in found.pairs)
     for side, frame in VIEWS:
         depth, truth = found.pairs[frame].depth[side], sequence.depth("rs", side, frame)

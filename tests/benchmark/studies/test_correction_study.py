@@ -160,7 +160,7 @@ def test_a_failed_method_scores_the_worst_and_the_study_goes_on(
     def nothing(*_: object) -> RobustEstimate:
         return RobustEstimate(estimate=failed, iterations=0, seconds=0.0, threshold_px=1.0)
 
-    for module in ("frame_motion", "one_camera"):
+    for module in ("frame_motion", "baseline_motions"):
         monkeypatch.setattr(f"rsbench.pipeline.{module}.estimate_motion", nothing)
     rows, bands, motions = study_dataset(smoke_dataset, lambda word: None)
     images = pd.DataFrame(rows)

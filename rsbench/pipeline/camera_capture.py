@@ -1,17 +1,15 @@
-"""The estimate of what the card of a camera whose frames are corrected alone does not give."""
+"""Estimate the capture of one camera's frames: shutter and focal length, if its card does not give them."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.calibration import RefusedFramesError
-from rsbench.capture.hypotheses import scans_of
 from rsbench.capture.self_calibration import (
     CENTRE_SIGMA,
     PRIOR,
@@ -29,15 +27,16 @@ from rsbench.capture.shutter_decision import (
     examine_alone,
     fits_backwards,
     known_alone,
-    runs_backwards,
-    shutter_alone,
+    shutter_found,
 )
 from rsbench.capture.two_frame_estimate import Capture, Window
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.errors import RsbenchError
-from rsbench.core.shutter import RollingShutter, Scan, Scanning
+from rsbench.core.rig import StereoRig
+from rsbench.core.shutter import Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import OneCameraCard, check_alike
+from rsbench.pipeline.frame_capture import KnownCapture, refuse_backwards
 from rsbench.pipeline.mono_correction import STILL, flow_matches, refusal, trajectory_matches
 from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.mono_fusion import find_flows
@@ -54,26 +53,6 @@ chosen because one pair did."""
 _FEWEST_PAIRS, _MOST_EXAMINED = 6, 60
 """Fewest successive pairs that determine a trajectory; number of pairs that are examined for them."""
 TOO_FEW = "frames: fewer than two; the motion of one camera needs at least two"
-BACKWARDS = (
-    "time runs backwards in them: they are in the reverse order, or lines are read from the side opposite to the "
-    "given one (`scan` in the camera's card)"
-)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FoundShutter:
-    """The shutter of a camera, and the estimate that it comes from."""
-
-    shutter: RollingShutter
-    capture: Capture | None
-    """None if the card gives the shutter."""
-    focal: FoundFocal | None = None
-    """The focal length, if it was estimated with the shutter."""
-
-    @property
-    def scan(self) -> Scan:
-        """The side at which the readout begins."""
-        return self.shutter.scan_of("left")
 
 
 def find_shutter(
@@ -84,8 +63,10 @@ def find_shutter(
     seed: int = 0,
     advance: Callable[[str], None] = lambda word: None,
     starts: FloatArray | None = None,
-) -> FoundShutter:
-    """The shutter of a camera, from its card or its frames (H, W[, 3]); refuses frames in reverse order.
+) -> KnownCapture:
+    """A camera and its shutter, from its card or its frames (H, W[, 3]); refuses frames in reverse order.
+
+    An unknown focal length is estimated too if one trajectory explains the frames; else see ``find_focal``.
 
     Args:
         frames: frames in order; they are iterated once.
@@ -102,26 +83,22 @@ def find_shutter(
     """
     if card.readout_ratio is None:
         return _estimate_shutter(frames, count, card, options, seed, advance, starts)
-    scan, ratio = card.scan or "top", card.readout_ratio
-    found, shutter = list[FloatArray](), None
+    scanning, ratio = Scanning(scan=card.scan or "top"), card.readout_ratio
+    found, known = list[FloatArray](), None
     for matches, _, camera in matched_pairs(frames, card, 1, IN_ORDER if ratio >= LEAST_BACKWARDS else 0, seed):
-        shutter = shutter or Scanning(scan=scan).shutter_of(camera.width, camera.height, ratio)
+        rig = StereoRig.of_one(camera)
+        known = KnownCapture(rig=rig, shutter=rig.shutter_of(scanning, ratio))
         if matches is None:
             continue
         advance("order of the frames")
-        if not fits_backwards(matches, camera, shutter, options, seed):
-            return FoundShutter(shutter=shutter, capture=None)
+        if not fits_backwards(matches, camera, known.shutter, options, seed):
+            return known
         found.append(matches)
-    assert shutter is not None
+    assert known is not None
     if found:
-        windows = [examine_alone(matches, camera, known_alone(scan), options, seed) for matches in found]
-        _refuse_backwards(conclude_alone(windows), shutter)
-    return FoundShutter(shutter=shutter, capture=None)
-
-
-def _refuse_backwards(capture: Capture, shutter: RollingShutter) -> None:
-    if runs_backwards(capture, scans_of(replace(shutter, readout_ratio=1.0))):
-        raise RefusedFramesError(BACKWARDS)
+        windows = [examine_alone(matches, camera, known_alone(scanning.scan), options, seed) for matches in found]
+        refuse_backwards(conclude_alone(windows), known.rig, scanning)
+    return known
 
 
 def _estimate_shutter(
@@ -132,7 +109,7 @@ def _estimate_shutter(
     seed: int,
     advance: Callable[[str], None],
     starts: FloatArray | None,
-) -> FoundShutter:
+) -> KnownCapture:
     """Estimate the shutter from a trajectory through successive pairs, or else from single pairs."""
     first, run, camera = _successive_matches(frames, card, seed, advance)
     focal_sigma, on_trajectory = PRIOR if card.focal_unknown else 0.0, None
@@ -142,7 +119,8 @@ def _estimate_shutter(
         on_trajectory = capture_of_video(run, camera, card.scan, seed, focal_sigma, times, centre_sigma)
     if on_trajectory is not None:
         focal = focal_of_capture(on_trajectory, camera.width) if card.focal_unknown else None
-        return replace(_conclude(on_trajectory, camera, card), focal=focal)
+        known = _concluded(on_trajectory, camera, card)
+        return known if focal is None else _with_focal(known, focal)
     known, windows, camera, why = known_alone(card.scan, focal_sigma), list[Window](), None, ""
     for matches, reason, camera in matched_pairs(frames, card, max((count - 1) // WINDOWS, 1), WINDOWS, seed):
         why = why or reason
@@ -154,13 +132,13 @@ def _estimate_shutter(
         raise NoMotionError(why)
     if not windows:
         raise NoMotionError(f"cannot tell the readout ratio: {why}. Give readout_ratio in the camera's card")
-    return _conclude(conclude_alone(windows), camera, card)
+    return _concluded(conclude_alone(windows), camera, card)
 
 
-def _conclude(capture: Capture, camera: PinholeCamera, card: OneCameraCard) -> FoundShutter:
-    if card.scan is not None:
-        _refuse_backwards(capture, Scanning(scan=card.scan).shutter_of(camera.width, camera.height, 1.0))
-    return FoundShutter(shutter=shutter_alone(capture, camera), capture=capture)
+def _concluded(capture: Capture, camera: PinholeCamera, card: OneCameraCard) -> KnownCapture:
+    rig = StereoRig.of_one(camera)
+    refuse_backwards(capture, rig, None if card.scan is None else Scanning(scan=card.scan))
+    return KnownCapture(rig=rig, shutter=shutter_found(capture, rig), capture=capture)
 
 
 def _successive_matches(
@@ -216,41 +194,35 @@ def matched_pairs(
         raise RsbenchError(TOO_FEW)
 
 
-# The camera of a video: from its card, with a focal length estimated from its frames, or with the default.
+# The focal length of a video, if its camera's card does not give it.
 
 
 PAIRS = 5
 """Most pairs of frames from which the focal length is estimated; they are evenly spaced in the video."""
 
 
-def find_camera_alone(
+def find_focal(
     frames: Iterable[NDArray[Any]],
     count: int,
     card: OneCameraCard,
-    shutter: RollingShutter,
+    known: KnownCapture,
     options: RobustOptions,
     seed: int = 0,
     advance: Callable[[str], None] = lambda word: None,
-    found: FoundFocal | None = None,
-) -> tuple[PinholeCamera, FoundFocal | None]:
-    """The camera, and the estimate of its focal length from the frames; None if the card gives it.
+) -> KnownCapture:
+    """Estimate the focal length from the frames with a known shutter; the width is used if they do not show it.
 
     Args:
-        frames, count, card, options, seed, advance: see ``find_shutter``.
-        shutter: shutter of the camera.
-        found: the focal length if it was estimated with the shutter.
-
-    Raises:
-        RsbenchError: there are fewer than two frames, or frames of two sizes.
+        known: result of ``find_shutter``; all others: see there.
     """
-    camera, pairs = None, list[PairFocal | None]()
-    wanted = PAIRS if card.focal_unknown and found is None else 0
-    for matches, _, camera in matched_pairs(frames, card, max((count - 1) // PAIRS, 1), wanted, seed):
+    pairs, camera, every = list[PairFocal | None](), known.rig.camera, max((count - 1) // PAIRS, 1)
+    for matches, *_ in matched_pairs(frames, card, every, PAIRS, seed):
         if matches is not None:
-            pairs.append(focal_of_pair(matches, (camera.width, camera.height), shutter, options, seed))
+            pairs.append(focal_of_pair(matches, (camera.width, camera.height), known.shutter, options, seed))
             advance(f"pair {len(pairs)}")
-    assert camera is not None
-    if not card.focal_unknown:
-        return camera, None
-    found = found or conclude_focal(pairs, camera.width)
-    return PinholeCamera.centred(camera.width, camera.height, found.focal), found
+    return _with_focal(known, conclude_focal(pairs, camera.width))
+
+
+def _with_focal(known: KnownCapture, focal: FoundFocal) -> KnownCapture:
+    camera = PinholeCamera.centred(known.rig.camera.width, known.rig.camera.height, focal.focal)
+    return replace(known, rig=StereoRig.of_one(camera), focal=focal)
