@@ -299,11 +299,11 @@ def ratio_of_sequence(
     starts = [_Place(_FIRST), *(_Place(ratio, by) for ratio in _OTHERS if alone for by in away)]
     for number, scanning in enumerate(scannings):
         profile = _Profile(few, rig, scanning, times, focal_sigma, centre_sigma)
-        first = profile.first_spline(seed)
-        started = _likeliest(partial(profile.started, curve=first), starts, _ROUGH)
+        spline = profile.first_spline(seed)
+        started = _likeliest(partial(profile.started, curve=spline), starts, _ROUGH)
         rough = _likeliest(profile.rough, started, _REFINED)
         if alone:
-            straight = _likeliest(profile.started_straight, profile.straight(first), 1)
+            straight = _likeliest(profile.started_straight, profile.straight(spline), 1)
             rough += _likeliest(profile.rough, straight, 1)
         refined = _likeliest(profile.refined_with_noise, rough, len(rough))
         refined += _likeliest(profile.refined_without_dashboard, refined[:1] if alone else [], 1)
@@ -316,7 +316,8 @@ def ratio_of_sequence(
     try:
         profile = _Profile(fewer(windows, _TRACKS), rig, scannings[best], times, focal_sigma, centre_sigma)
         profile = profile.with_noise_of(first)
-        top, covariance = profile.most_evident(profile.refined_again(first))
+        likeliest = profile.refined_again(first)
+        top, covariance = profile.most_evident(likeliest)
         dispersion = profile.dispersion(top, covariance)
     except NotDefiniteError:
         return None
@@ -324,6 +325,9 @@ def ratio_of_sequence(
     places = np.array([each.place[:2] for each in rivals])
     likely = tempered([np.exp(each.evidence - first.evidence) for each in rivals], dispersion)
     covariance = dispersion * covariance + spread_about(places[0], likely, places)
+    # Where the approximation of the evidence holds, it is largest near the likeliest fit.
+    both = np.array([top.place[:2], likeliest.place[:2]])
+    covariance += spread_about(both[0], np.array([0.5, 0.5]), both)
     estimate = profile.result(top, covariance, 1.0 / float(odds))
     # Refuse fits to two or three wrong matches, and fits to all of them with an error scale too large for noise.
     right = estimate.used >= _LEAST_SHARE * estimate.total and estimate.noise_px <= MOST_NOISE_PX

@@ -28,8 +28,12 @@ def _run(out: Path, *arguments: Any) -> dict[str, Any]:
     return record
 
 
-@pytest.mark.parametrize("sigmas", [{}, {"focal_sigma": 20.0, "k1_sigma": 0.02}], ids=["exact", "unsure"])
-@pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.slow)])
+UNSURE = {"focal_sigma": 20.0, "k1_sigma": 0.02}
+
+
+@pytest.mark.parametrize(
+    ("known", "sigmas"), [(True, {}), (True, UNSURE), pytest.param(False, {}, marks=pytest.mark.slow)]
+)
 def test_of_a_rig(known: bool, sigmas: dict[str, Any], castle: Sequence, tmp_path: Path) -> None:
     ratio, rig = castle.shutter.readout_ratio, tmp_path / "rig.toml"
     write_rig(rig, castle.rig, ratio if known else None, "".join(f"{name} = {x}\n" for name, x in sigmas.items()))
