@@ -26,7 +26,6 @@ from rsbench.capture.trajectory_estimate import MOST_NOISE_PX, TrajectoryOptions
 from rsbench.capture.trajectory_fit import (
     ANCHORED,
     DAMPING,
-    DIRECTIONS,
     SHORT,
     Equations,
     Fit,
@@ -39,6 +38,7 @@ from rsbench.capture.trajectory_fit import (
     normal_equations,
     right_tracks,
     squared_errors,
+    straight_curves,
     variances,
     window_motions,
 )
@@ -303,7 +303,7 @@ def ratio_of_sequence(
         started = _likeliest(partial(profile.started, curve=spline), starts, _ROUGH)
         rough = _likeliest(profile.rough, started, _REFINED)
         if alone:
-            straight = _likeliest(profile.started_straight, profile.straight(spline), 1)
+            straight = _likeliest(profile.started_straight, straight_curves(spline, 0.0), 1)
             rough += _likeliest(profile.rough, straight, 1)
         refined = _likeliest(profile.refined_with_noise, rough, len(rough))
         refined += _likeliest(profile.refined_without_dashboard, refined[:1] if alone else [], 1)
@@ -492,18 +492,12 @@ class _Profile:
         span = span_of(float(self._times[-1]), self._shutter(1.0))
         return first_curve(motions, self.tracks(first), span, _KNOTS, self._times)
 
-    def straight(self, curve: Curve) -> list[Curve]:
-        """Splines with the rotations of one, and a uniform translation in each of some directions.
+    def started_straight(self, curve: Curve) -> _Found:
+        """The fit of a nearly uniform translation, from a spline, at ``_FIRST``.
 
         Where a third of the image moves with the camera, or its lens is long, translations across the optical axis
         explain in part what rotations do, and motions of single windows change between both.
         """
-        taus = curve.first + curve.interval * (np.arange(len(curve.p)) - 1.0)
-        directions = SHORT * DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
-        return [make_curve(curve.first, curve.interval, curve.R, taus[:, None] * each) for each in directions]
-
-    def started_straight(self, curve: Curve) -> _Found:
-        """The fit of a nearly uniform translation, from a spline, at ``_FIRST``."""
         place, prior = _Place(_FIRST), TrajectoryOptions().prior._replace(position=_STRAIGHT)
         tracks = self.tracks(place)
         return self._found(place, fit(curve, tracks, prior, False, _WIDE, np.ones(len(tracks))))

@@ -50,7 +50,6 @@ from rsbench.capture.trajectory_tracks import (
     LEAST_SCALE_PX,
     REACH,
     Past,
-    Shared,
     Tails,
     TimedTracks,
     add_tracks,
@@ -108,7 +107,7 @@ _WALLS = 4
 """Most times at which a trajectory is tried with all later translations negated, and most such changes."""
 _ONE_SIGN = 0.95
 """Mean sign of the inverse depths below which a fit may be a local minimum, and other starts are tried."""
-DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], float)
+_DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], float)
 """(n, 3) axes and diagonals; their opposites are as good."""
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Candidates for ``Prior.memory``, frame periods."""
@@ -187,7 +186,7 @@ def normal_equations(
         cost += 0.5 * rough.squares[kind] / strength
         gradient += rough.gradients[kind] / strength
         band += rough.bands[kind] / strength
-    found, border = None, None if tracks.by_ratio is None else Border(*shared)
+    found, border = None, None if tracks.by_ratio is None else shared
     if tracks.gyro is not None and drift is not None:
         found = sensed(curve, tracks.gyro, drift, width)
         gradient += found.gradient / drift.variance
@@ -204,7 +203,7 @@ def _add_in_threads(
     tracks: TimedTracks,
     tails: Tails,
     trust: FloatArray,
-    out: tuple[FloatArray, FloatArray, FloatArray, Shared],
+    out: tuple[FloatArray, FloatArray, FloatArray, Border],
     want: bool,
 ) -> float:
     """``add_tracks``; many tracks run as two halves in threads, on all machines, so that sums are identical."""
@@ -213,20 +212,10 @@ def _add_in_threads(
     if len(trust) < _MANY:
         return add_tracks(curve, tracks.ends, starts, *same, trust, *out, by_ratio, want)
     squares, band, gradient, shared = out
-    later = np.zeros_like(band), np.zeros_like(gradient), Shared(*map(np.zeros_like, shared))
+    later = np.zeros_like(band), np.zeros_like(gradient), Border(*map(np.zeros_like, shared))
     with ThreadPoolExecutor(1) as pool:
-        half = (
-            curve,
-            tracks.ends,
-            starts[middle:],
-            *same,
-            trust[middle:],
-            squares[middle:],
-            *later,
-            by_ratio,
-            want,
-        )
-        other = pool.submit(add_tracks, *half)
+        half = curve, tracks.ends, starts[middle:], *same, trust[middle:], squares[middle:]
+        other = pool.submit(add_tracks, *half, *later, by_ratio, want)
         half = trust[:middle], squares[:middle], band, gradient, shared, by_ratio, want
         cost = add_tracks(curve, tracks.ends, starts[: middle + 1], *same, *half)
     cost += other.result()
@@ -531,7 +520,6 @@ def first_curve_of_camera(
     count = len(tracks.members)
     times = np.arange(count + 1.0) if times is None else times
     start = first_curve(motions, tracks, span, _TRIED_KNOTS, times)
-    taus = start.first + start.interval * (np.arange(len(start.p)) - 1.0)
 
     def fitted(curve: Curve, steps: int, first: int = 0, last: int = count) -> _Place:
         """The fit to the windows from ``first`` to before ``last``."""
@@ -543,11 +531,8 @@ def first_curve_of_camera(
 
     def extended(first: int) -> _Place:
         """The best direction in the windows from ``first`` on, extended to all windows."""
-        last, turn = min(first + _TRIED, count), evaluate(start, times[first])[0].R
-        speeds = SHORT * (DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)) @ turn
-        straight = ((taus - times[first])[:, None] * speed for speed in speeds)
-        tried = [make_curve(start.first, start.interval, start.R, p) for p in straight]
-        places = [fitted(each, _STEPS_TRIED, first, last) for each in tried]
+        last = min(first + _TRIED, count)
+        places = [fitted(each, _STEPS_TRIED, first, last) for each in straight_curves(start, times[first])]
         curve = min(places, key=lambda each: each.equations.cost).curve
         while last - first < count:
             first, last = max(first - 1, 0), min(last + 1, count)
@@ -575,6 +560,15 @@ def first_curve_of_camera(
     if np.sum(_signs(curve, tracks)) < 0.0:
         curve = from_pose_at(make_curve(curve.first, curve.interval, curve.R, -curve.p), 0.0)
     return approximated(lambda tau: evaluate(curve, tau)[0], (curve.first, curve.last), interval)
+
+
+def straight_curves(curve: Curve, start: float) -> list[Curve]:
+    """Splines with the rotations of one, and uniform translations from a time on in several directions."""
+    taus = curve.first + curve.interval * (np.arange(len(curve.p)) - 1.0) - start
+    speeds = (
+        SHORT * (_DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)) @ evaluate(curve, start)[0].R
+    )
+    return [make_curve(curve.first, curve.interval, curve.R, taus[:, None] * speed) for speed in speeds]
 
 
 def _signs(curve: Curve, tracks: TimedTracks) -> FloatArray:

@@ -123,14 +123,15 @@ class GyroFound:
 
 
 class Border(NamedTuple):
-    """The parts of the normal equations that involve a gyroscope's errors."""
+    """The parts of the normal equations that involve m unknowns besides the control poses, as a gyroscope's errors
+    (13)."""
 
     mixed: FloatArray
-    """(6 controls, 13)."""
+    """(6 controls, m)."""
     corner: FloatArray
-    """(13, 13)."""
+    """(m, m)."""
     slope: FloatArray
-    """(13,) gradient."""
+    """(m,) gradient."""
 
 
 class Sensed(NamedTuple):

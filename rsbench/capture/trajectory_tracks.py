@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rsbench.capture.trajectory_gyro import GyroSteps
+from rsbench.capture.trajectory_gyro import Border, GyroSteps
 from rsbench.capture.trajectory_spline import Curve, Views, blank_views, fill_view
 from rsbench.components.compiled import compiled
 from rsbench.components.motion_kernels import Vector, apply, apply_transposed, cross, plus, times
@@ -66,21 +66,10 @@ class Tails(NamedTuple):
     """px."""
 
 
-class Shared(NamedTuple):
-    """Parts of the normal equations that involve the ``SHARED`` unknowns; without columns, they are not wanted."""
-
-    mixed: FloatArray
-    """(6 controls, m)"""
-    corner: FloatArray
-    """(m, m)"""
-    slope: FloatArray
-    """(m,) gradient."""
-
-
-def blank_shared(controls: int, wanted: bool) -> Shared:
-    """Parts of 0 for a spline with this number of control poses."""
+def blank_shared(controls: int, wanted: bool) -> Border:
+    """Equations of 0 of the ``SHARED`` unknowns, or of none, for a spline with this number of control poses."""
     count = SHARED if wanted else 0
-    return Shared(np.zeros((6 * controls, count)), np.zeros((count, count)), np.zeros(count))
+    return Border(np.zeros((6 * controls, count)), np.zeros((count, count)), np.zeros(count))
 
 
 class Scratch(NamedTuple):
@@ -120,7 +109,7 @@ class Scratch(NamedTuple):
     """(n, 2) velocity of the ideal pixel, px per frame period."""
     E: FloatArray
     """(2, SHARED) derivatives of one observation by the shared unknowns."""
-    S: Shared
+    S: Border
     """Equations of one track that involve these unknowns."""
     T: FloatArray
     """(3, SHARED) mixed part of the point and these unknowns."""
@@ -147,7 +136,7 @@ def _scratch(ends: int, size: int, shared: int) -> Scratch:
         np.zeros(size),
         np.zeros((ends, 2)),
         np.zeros((2, SHARED)),
-        Shared(np.zeros((size, shared)), np.zeros((shared, shared)), np.zeros(shared)),
+        Border(np.zeros((size, shared)), np.zeros((shared, shared)), np.zeros(shared)),
         np.zeros((3, SHARED)),
     )
 
@@ -163,7 +152,7 @@ def add_tracks(
     squares: FloatArray,
     band: FloatArray,
     gradient: FloatArray,
-    shared: Shared,
+    shared: Border,
     by_ratio: FloatArray,
     want: bool,
 ) -> float:
@@ -182,9 +171,8 @@ def add_tracks(
     most = 0
     for k in range(len(starts) - 1):
         most = max(most, starts[k + 1] - starts[k])
-    scratch = _scratch(
-        int(most), band.shape[1], len(shared.slope)
-    )  # without int(), compiled for the literal 0 as well
+    # Without int(), it would be compiled for the literal 0 as well.
+    scratch = _scratch(int(most), band.shape[1], len(shared.slope))
     total = 0.0
     for k in range(len(starts) - 1):
         track = ends[starts[k] : starts[k + 1]]
@@ -358,7 +346,7 @@ def _add_track(
     weight: float,
     band: FloatArray,
     gradient: FloatArray,
-    shared: Shared,
+    shared: Border,
     by_ratio: FloatArray,
 ) -> None:
     """Add the normal equations with the point eliminated: H = Dc^T Dc - Q N^-1 Q^T with Q = Dc^T Dp."""
@@ -423,7 +411,7 @@ def _add_shared(end: FloatArray, by_ratio: FloatArray, n: int, first: int, focal
 
 
 @compiled(error_model="numpy")
-def _reduce_shared(s: Scratch, size: int, weight: float, first: int, shared: Shared) -> None:
+def _reduce_shared(s: Scratch, size: int, weight: float, first: int, shared: Border) -> None:
     """Eliminate the point from the equations of a track and the shared unknowns; ``_reduce`` comes before."""
     best = _forward(s.L, (s.left[0], s.left[1], s.left[2]))
     for j in range(SHARED):
