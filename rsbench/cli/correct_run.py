@@ -44,6 +44,7 @@ from rsbench.storage.videos import ORIENTATIONS, UPRIGHT, upright, write_frames
 from rsbench.vision.corrector import CorrectorEntry, NotCorrectedError, demand_corrected
 from rsbench.vision.correctors import FusionCorrector
 from rsbench.vision.fusion import finished
+from rsbench.vision.images import single_opencv
 
 _MOST_LISTED = 8
 SUBTITLE = "Rolling shutter to global shutter"
@@ -204,7 +205,8 @@ def _correct_sequence(given: CorrectInput, target: str, options: CorrectionOptio
     else:
         _say_input(given, sources[0], first[0].shape, options)
     run = _run_key(given, sources, options, close, gyro)
-    with results.video_place(out, run) if given.video else results.fresh_folder(out, run=run) as folder:
+    place = results.video_place(out, run) if given.video else results.fresh_folder(out, run=run)
+    with single_opencv(), place as folder:
         known = know_capture(sources, card, options, gyro, progress_bar)
         record = results.capture_record(known, options)
         record["frames"] = _correct_into(folder, sources, known, options, close, given)

@@ -137,6 +137,8 @@ def _rotation_only(found: FoundMotion) -> FoundMotion:
 
 _AHEAD = 4
 """Number of windows that are matched, and of frames that are corrected, in advance."""
+_DEPTHS_AHEAD = 2
+"""Number of windows that get a motion and stereo depth in advance."""
 
 
 def correct_sequence(
@@ -170,7 +172,7 @@ def correct_sequence(
     windows = ahead(_windows(left, right, known, options, not on_trajectory), _AHEAD)
     if on_trajectory:
         windows = on_one_trajectory(windows, known, options.seed, options.solver.name)
-    deep = _with_depth(windows, known, options, first)
+    deep = ahead(_with_depth(windows, known, options, first), _DEPTHS_AHEAD)
     places = (each for each in _frames_of(deep) if each[0] >= first)
     # A component of another package may not be thread-safe.
     threads = 2 if options.corrector.built_in and options.matcher.built_in else 1

@@ -429,6 +429,25 @@ def warp(
     Pixels under ``sky_mask`` (H, W) are infinitely far. Raises ValueError on other shapes or types.
     """
     options = options or WarpOptions()
+    source_map, buffer = drawn(view, camera, target_pose, sky_mask, options)
+    mask = buffer >= 0.0
+    return Corrected(
+        image=resample(view.image, source_map, options.interpolation),
+        mask=mask,
+        source_map=source_map,
+        depth=depth_of(buffer),
+    )
+
+
+def drawn(
+    view: LineView,
+    camera: PinholeCamera,
+    target_pose: Pose,
+    sky_mask: NDArray[np.bool_] | None,
+    options: WarpOptions,
+) -> tuple[F32, F32]:
+    """The source pixel (H, W, 2) of each target pixel of ``warp``, and inverse depth (H, W) there: NaN and -1
+    where the frame did not see the target."""
     _check(view.image, view.depth, view.camera or camera, view.poses, sky_mask, view.columns)
     maps = line_maps(camera, view.poses, target_pose, view.columns, view.camera)
     rho = inverse_depth(view.depth, sky_mask)
@@ -439,13 +458,7 @@ def warp(
     buffer = np.full(size, -1.0, dtype=np.float32)
     draw_mesh(rho, joined, maps, source_map, buffer)
     draw_cells(rho, joined, maps, source_map, buffer)
-    mask = buffer >= 0.0
-    return Corrected(
-        image=resample(view.image, source_map, options.interpolation),
-        mask=mask,
-        source_map=source_map,
-        depth=_depth(buffer, mask),
-    )
+    return source_map, buffer
 
 
 def correct_frame(
@@ -503,10 +516,11 @@ def _target_time(shutter: RollingShutter, side: Side, frame: int, target_tau: fl
     return tau
 
 
-def _depth(buffer: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def depth_of(buffer: F32) -> F32:
+    """Depth (...) of inverse depths (...) of ``drawn``; NaN where the frame did not see the target."""
     depth = np.full(buffer.shape, np.nan, dtype=np.float32)
     with np.errstate(divide="ignore"):  # at infinity
-        return np.divide(np.float32(1.0), buffer, out=depth, where=mask)
+        return np.divide(np.float32(1.0), buffer, out=depth, where=buffer >= 0.0)
 
 
 def _check(

@@ -7,7 +7,7 @@ time. Their flow does, scaled by the times of the rows, if they move uniformly i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, final
 
@@ -66,10 +66,6 @@ class _Still(NamedTuple):
     hidden: Mask
     """Whether a nearer surface hides the point, so that the other frame shows another colour there."""
 
-    def half(self) -> _Still:
-        """The same at half the image's size."""
-        return _Still(self.far[1::2, 1::2] / 2.0, self.near[1::2, 1::2] / 2.0, self.hidden[1::2, 1::2])
-
 
 class Moving(NamedTuple):
     """Independently moving objects in a frame."""
@@ -95,58 +91,75 @@ def find_moving(
     size = max(rig.sensor(side).width * rig.sensor(side).height for side in SIDES)
     grids = {side: rig.sensor(side).pixel_grid().astype(np.float32) for side in SIDES}
 
-    def stays(view: View) -> _Still:
+    def stays(view: View, step: int = 1) -> _Still:
+        """Motion of every ``step``-th pixel in each direction, in pixels of an image smaller by this factor."""
         axis, other, camera, grid = shutter.axis(view[0]), _other(view), rig.sensor(view[0]), grids[view[0]]
-        off = _DISPARITY_PX / (camera.fx * rig.baseline)
+        off, chosen = _DISPARITY_PX / (camera.fx * rig.baseline), np.s_[step - 1 :: step, step - 1 :: step]
         maps = reprojection_of(camera, poses[view], poses[other], (axis, axis))
-        lines, rho = np.indices(depth[view].shape, dtype=np.int32)[1 - axis], inverse_depth(depth[view])
+        lines, rho = np.indices(depth[view].shape, dtype=np.int32)[1 - axis], np.full_like(depth[view], np.nan)
+        rho[chosen] = inverse_depth(depth[view][chosen])  # NaN is skipped
         both = np.maximum(rho - np.float32(off), np.float32(0.0)), rho + np.float32(off)
-        (far, first), (near, second) = (reproject_pixels(maps, each, np.ascontiguousarray(lines)) for each in both)
+        ends = [reproject_pixels(maps, each, np.ascontiguousarray(lines)) for each in both]
+        (far, first), (near, second) = ((places[chosen], factors[chosen]) for places, factors in ends)
         there = cv2.dilate(np.nan_to_num(inverse_depth(depth[other])), np.ones((_EDGE, _EDGE), np.uint8))
-        before = np.float32(1.0 + _SAME_DEPTH) * np.maximum(both[0] * first, both[1] * second) + np.float32(off)
-        far, near = np.asarray(far - grid), np.asarray(near - grid)
-        between = np.asarray((far + near) / 2.0, dtype=np.float32)
-        return _Still(far, near, np.asarray(followed(there, between, cv2.BORDER_CONSTANT) > before))
+        farther, nearer = (each[chosen] for each in both)
+        before = np.float32(1.0 + _SAME_DEPTH) * np.maximum(farther * first, nearer * second) + np.float32(off)
+        far, near = np.asarray(far - grid[chosen]), np.asarray(near - grid[chosen])
+        ends_at = grid[chosen] + np.asarray((far + near) / 2.0, dtype=np.float32)
+        seen = cv2.remap(there, ends_at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return _Still(far / np.float32(step), near / np.float32(step), np.asarray(seen > before))
 
     first = VIEWS[0]
     half = rig.sensor("left").width // 2, rig.sensor("left").height // 2
     if min(half) < _SMALLEST:
         return {}
     small = [np.asarray(cv2.resize(grey_u8(images[view]), half)) for view in (first, _other(first))]
-    quick = dense_flow(*small), dense_flow(*small[::-1])
-    if not np.any(_moved(small, *quick, stays(first).half(), 0.5 * _MOVED_PX)):
+    flow = dense_flow(*small)
+    if not np.any(_moved(small, flow, lambda: dense_flow(*small[::-1]), stays(first, 2), 0.5 * _MOVED_PX)):
         return {}
     both = map_frames(lambda view: dense_flow(images[view], images[_other(view)]), VIEWS, size, _FLOW_BYTES)
     flows, greys = dict(zip(VIEWS, both, strict=True)), {view: grey_u8(images[view]) for view in VIEWS}
 
     def found(view: View) -> Moving:
         other = _other(view)
-        mask = _moved((greys[view], greys[other]), flows[view], flows[other], stays(view), _MOVED_PX)
+        mask = _moved((greys[view], greys[other]), flows[view], lambda: flows[other], stays(view), _MOVED_PX)
         return _outlined(Moving(mask, flows[view]), inverse_depth(depth[view]))
 
     return dict(zip(VIEWS, map_frames(found, VIEWS, size, _FLOW_BYTES), strict=True))
 
 
-def _moved(greys: Sequence[NDArray[np.uint8]], flow: F32, back: F32, still: _Still, least: float) -> Mask:
+def _moved(
+    greys: Sequence[NDArray[np.uint8]], flow: F32, back: Callable[[], F32], still: _Still, least: float
+) -> Mask:
     """(H, W) large regions whose consistent flow ends off the curves on which static points move.
 
-    The place by flow must also look clearly more similar: flow has errors too.
+    The place by flow must also look clearly more similar: flow has errors too. The flow ``back`` is computed only
+    if there are such regions without it.
     """
     far, along = still.far, still.near - still.far
     share = np.sum((flow - far) * along, axis=-1) / np.maximum(np.sum(along * along, axis=-1), np.float32(1e-6))
     nearest = far + np.clip(share, 0.0, 1.0)[..., None] * along
     moved = np.linalg.norm(flow - nearest, axis=-1) > least  # False for NaN
-    moved &= (returns_px(flow, back) < _RETURNS_PX) & ~still.hidden
-    dense = cv2.medianBlur(moved.astype(np.uint8), _MEDIAN)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(dense, connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] >= _LEAST * moved.size
-    large[0] = False
+    moved &= ~still.hidden
+    if not np.any(_large_regions(moved)[1]):
+        return np.zeros_like(moved)
+    labels, large = _large_regions(moved & (returns_px(flow, back()) < _RETURNS_PX))
     if not np.any(large):
         return np.zeros_like(moved)
-    chosen = large[labels] & np.isfinite(nearest[..., 0]) & ~still.hidden
+    chosen, count = large[labels] & np.isfinite(nearest[..., 0]) & ~still.hidden, len(large)
     unlike = [np.bincount(labels[chosen], _unlike(greys, each)[chosen], count) for each in (flow, nearest)]
     large &= unlike[0] + _NOISE_LEVELS * np.bincount(labels[chosen], minlength=count) < _CLEARLY * unlike[1]
     return np.asarray(large[labels])
+
+
+def _large_regions(mask: Mask) -> tuple[NDArray[np.int32], Mask]:
+    """Labels (H, W) of regions where most pixels are in a mask (H, W), and whether each label (n,) is a large
+    one."""
+    dense = cv2.medianBlur(mask.astype(np.uint8), _MEDIAN)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(dense, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= _LEAST * mask.size
+    large[0] = False
+    return labels, large
 
 
 def _unlike(greys: Sequence[NDArray[np.uint8]], flow: F32) -> F32:

@@ -234,13 +234,23 @@ def _search(
 
 def census(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
     """(H, W) census of 24 bits: which of the 5 x 5 neighbours are darker than the pixel."""
-    padded = cv2.copyMakeBorder(grey, 2, 2, 2, 2, cv2.BORDER_REPLICATE)
-    height, width = grey.shape
     bits = np.zeros(grey.shape, dtype=np.uint32)
-    for k in range(25):
-        if k != 12:
-            bits = (bits << np.uint32(1)) | (padded[k // 5 :, k % 5 :][:height, :width] < grey)
+    _fill_census(cv2.copyMakeBorder(grey, 2, 2, 2, 2, cv2.BORDER_REPLICATE), bits)
     return bits
+
+
+@compiled(error_model="numpy")
+def _fill_census(padded: NDArray[np.uint8], bits: NDArray[np.uint32]) -> None:
+    """Fill ``bits`` (H, W) with the census of an image (H + 4, W + 4) that is padded by 2 px."""
+    height, width = bits.shape
+    for y in range(height):
+        row, centre = bits[y], padded[y + 2]
+        for k in range(25):
+            if k != 12:
+                down, right = k // 5, k % 5
+                beside = padded[y + down]
+                for x in range(width):
+                    row[x] = (row[x] << np.uint32(1)) | np.uint32(beside[x + right] < centre[x + 2])
 
 
 @compiled(error_model="numpy", inline="always")

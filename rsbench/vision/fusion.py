@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from rsbench.components.compiled import compiled
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.se3 import Pose
-from rsbench.vision.correction import Corrected, LineView, WarpOptions, inverse_depth, line_maps, move, warp
-from rsbench.vision.images import resample
+from rsbench.vision.correction import LineView, WarpOptions, depth_of, drawn, inverse_depth, line_maps, move, warp
+from rsbench.vision.images import resample_at
 from rsbench.vision.reprojection import LineMaps, across_lines, line_of, look, see
 from rsbench.vision.stereo_depth import known_beside
 
+F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
@@ -113,37 +114,63 @@ def fuse(
 
     Raises ValueError as ``rsbench.vision.correction.warp`` does.
     """
-    first, others = views[0], views[1:]
+    first, others, options = views[0], views[1:], options or WarpOptions()
     corrected = warp(first, camera, target_pose, options=options)
-    image, depth = corrected.image.copy(), corrected.depth.copy()
+    image, depth = corrected.image, corrected.depth
     origin = np.where(corrected.mask, np.uint8(first.origin), np.uint8(Origin.NOBODY))
     measured = [view for view in others if view.origin is not Origin.GUESSED]
     guessed = [view for view in others if view.origin is Origin.GUESSED]
-    contradicted: list[tuple[Corrected, Mask, Origin]] = []
+    contradicted: list[tuple[_Points, Origin]] = []
+
+    def fill(found: _Points, source: Origin) -> None:
+        image[found.at], depth[found.at], origin[found.at] = found.colour, found.depth, source
+
     for group in (measured, guessed):
         holes = origin == Origin.NOBODY
         for view in group:
             if not np.any(holes):
                 break
-            candidate = _warp_into(view, holes, camera, target_pose, options)
-            if candidate is None:
-                continue
+            found = _warp_into(view, holes, camera, target_pose, options)
             # If two views show a pixel of a hole, the nearer surface hides the other.
-            known = np.where(np.isnan(depth), np.float32(np.inf), depth)
-            nearer = candidate.depth < known * (1.0 - _AGREE)
-            take = candidate.mask & holes & ((origin == Origin.NOBODY) | nearer)
+            known = np.nan_to_num(depth[found.at], nan=np.inf, posinf=np.inf)
+            nearer = found.depth < known * (1.0 - _AGREE)
+            found = found.only((origin[found.at] == Origin.NOBODY) | nearer)
+            found = found.coloured(view.image, options)
             if view.origin is not Origin.GUESSED:
-                against = _contradicted(first, candidate, take, camera, target_pose)
-                contradicted.append((candidate, take & against, view.origin))
-                take &= ~against
-            image[take], depth[take] = candidate.image[take], candidate.depth[take]
-            origin[take] = view.origin
-    for candidate, mask, source in contradicted:  # only where nothing else fills the hole
-        take = mask & (origin == Origin.NOBODY)
-        image[take], depth[take], origin[take] = candidate.image[take], candidate.depth[take], source
+                against = _contradicted(first, found, camera, target_pose)
+                contradicted.append((found.only(against), view.origin))
+                found = found.only(~against)
+            fill(found, view.origin)
+    for found, source in contradicted:  # only where nothing else fills the hole
+        fill(found.only(origin[found.at] == Origin.NOBODY), source)
     if guessed:
         _close_tears(image, depth, origin, (first, *measured), camera, target_pose, options)
     return Fused(image=image, origin=origin, depth=depth)
+
+
+Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Rows and columns of n pixels."""
+
+
+class _Points(NamedTuple):
+    """Pixels of the target that a view shows."""
+
+    at: Pixels
+    depth: F32
+    """(n,)"""
+    source: F32
+    """(n, 2) pixels of the view."""
+    colour: NDArray[Any]
+    """(n[, C]), empty before ``coloured``."""
+
+    def only(self, which: Mask) -> _Points:
+        """Those of the points (n,)."""
+        (y, x), rest = self.at, (each[which] for each in self[1:])
+        return _Points((y[which], x[which]), *rest)
+
+    def coloured(self, image: NDArray[Any], options: WarpOptions) -> _Points:
+        """With colours from the view's image."""
+        return self._replace(colour=resample_at(image, self.source, options.interpolation))
 
 
 def _close_tears(
@@ -153,7 +180,7 @@ def _close_tears(
     views: Sequence[SourceView],
     camera: PinholeCamera,
     target_pose: Pose,
-    options: WarpOptions | None,
+    options: WarpOptions,
 ) -> None:
     """Fill, in place, holes within one surface from the first view that shows them; their origin is GUESSED.
 
@@ -161,17 +188,18 @@ def _close_tears(
     is a tear, due to pixels with unknown or wrong depth. It gets the depth of its sides, and is filled from a view
     unless that view has a nearer surface there.
     """
-    rho, interpolation = _surface_of_both_sides(inverse_depth(depth)), (options or WarpOptions()).interpolation
+    rho = _surface_of_both_sides(inverse_depth(depth))
     for view in views:
-        holes = (origin == Origin.NOBODY) & np.isfinite(rho)
-        if not np.any(holes):
+        at = np.nonzero((origin == Origin.NOBODY) & np.isfinite(rho))
+        if not len(at[0]):
             break
-        places, expected, known = _look_up(view, rho, holes, camera, target_pose)
-        take = np.isfinite(places[..., 0]) & ~(known * (1.0 - _AGREE) > expected)
-        image[take] = resample(view.image, places, interpolation)[take]
-        origin[take] = Origin.GUESSED
+        places, expected, known = _look_up(view, rho[at], at, camera, target_pose)
+        take = np.isfinite(places[:, 0]) & ~(known * (1.0 - _AGREE) > expected)
+        at = at[0][take], at[1][take]
+        image[at] = resample_at(view.image, places[take], options.interpolation)
+        origin[at] = Origin.GUESSED
         with np.errstate(divide="ignore"):  # at infinity
-            depth[take] = 1.0 / rho[take]
+            depth[at] = 1.0 / rho[at]
 
 
 def _surface_of_both_sides(rho: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -186,36 +214,34 @@ def _surface_of_both_sides(rho: NDArray[np.float32]) -> NDArray[np.float32]:
     return found
 
 
-def _contradicted(
-    frame: SourceView, found: Corrected, wanted: Mask, camera: PinholeCamera, target_pose: Pose
-) -> Mask:
-    """(H, W) mask of points of another view whose reprojection to ``frame`` shows something else.
+def _contradicted(frame: SourceView, found: _Points, camera: PinholeCamera, target_pose: Pose) -> Mask:
+    """(n,) mask of points of another view whose reprojection to ``frame`` shows something else.
 
     There the frame has a farther surface, or no depth and another colour: an object that only the frame shows,
     often near and thin, is in front of the point, which must not be drawn over it. If the frame has a nearer
-    surface, the point was hidden, which is no contradiction. Only points in ``wanted`` (H, W) are tested.
+    surface, the point was hidden, which is no contradiction.
     """
-    places, expected, known = _look_up(frame, inverse_depth(found.depth), wanted, camera, target_pose)
-    seen = np.isfinite(places[..., 0])
-    shown = resample(frame.image, places, "linear")
-    return seen & np.where(np.isnan(known), _differ(shown, found.image, seen), known < expected * (1.0 - _AGREE))
+    places, expected, known = _look_up(frame, inverse_depth(found.depth), found.at, camera, target_pose)
+    seen, unlike = np.isfinite(places[:, 0]), np.zeros(len(places), dtype=np.bool_)
+    shown = found.only(seen)._replace(colour=resample_at(frame.image, places[seen], "linear"))
+    unlike[seen] = _differ(shown, found.colour[seen], (camera.height, camera.width))
+    return seen & np.where(np.isnan(known), unlike, known < expected * (1.0 - _AGREE))
 
 
 def _look_up(
-    view: SourceView, rho: NDArray[np.float32], wanted: Mask, camera: PinholeCamera, target_pose: Pose
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Reproject the ``wanted`` (H, W) points of the target, with inverse depth ``rho`` (H, W), to a view.
+    view: SourceView, rho: F32, at: Pixels, camera: PinholeCamera, target_pose: Pose
+) -> tuple[F32, F32, F32]:
+    """Reproject pixels of the target with inverse depth ``rho`` (n,) to a view.
 
     Returns:
-        The pixels (H, W, 2), NaN outside the view; the inverse depth (H, W) of the points in the view; the view's
-        own inverse depth there, NaN where it is unknown.
+        The pixels (n, 2), NaN outside the view; the inverse depth (n,) of the points in the view; the view's own
+        inverse depth there, NaN where it is unknown.
     """
     own = view.camera or camera
     maps = line_maps(own, target_pose, view.poses, view.columns, camera)
-    places = np.full((*wanted.shape, 2), np.nan, dtype=np.float32)
-    expected = np.zeros(wanted.shape, dtype=np.float32)
-    _find_in_lines(rho, wanted, maps, own.width, own.height, places, expected)
-    inside, known = np.isfinite(places[..., 0]), np.full(wanted.shape, np.nan, dtype=np.float32)
+    places, expected = np.full((len(rho), 2), np.nan, dtype=np.float32), np.zeros(len(rho), dtype=np.float32)
+    _find_in_lines(rho, *at, maps, own.width, own.height, places, expected)
+    inside, known = np.isfinite(places[:, 0]), np.full(len(rho), np.nan, dtype=np.float32)
     # The frame ends half a pixel beyond the last centre, which may be rounded to the next pixel in float32.
     nearest = np.rint(places[inside]).astype(np.intp)
     x, y = np.clip(nearest, 0, (own.width - 1, own.height - 1)).T
@@ -223,65 +249,66 @@ def _look_up(
     return places, expected, known
 
 
-def _differ(a: NDArray[Any], b: NDArray[Any], where: Mask) -> Mask:
-    """(H, W) whether images differ in the mean over those of 3 x 3 pixels that are in ``where``."""
-    levels = np.iinfo(a.dtype).max if np.issubdtype(a.dtype, np.integer) else 1.0
-    apart = np.zeros(where.shape, dtype=np.float32)
-    each = np.abs(np.atleast_3d(a)[where].astype(np.float32) - np.atleast_3d(b)[where])
-    apart[where] = each.max(axis=-1) / np.float32(levels)
-    count = cv2.blur(where.astype(np.float32), (3, 3))
-    mean = cv2.blur(apart, (3, 3)) / np.maximum(count, np.float32(1e-6))
-    return np.asarray(mean > _DIFFERENT)
+def _differ(points: _Points, colour: NDArray[Any], shape: tuple[int, int]) -> Mask:
+    """(n,) whether colours differ from those of the points in the mean over the points in 3 x 3 pixels."""
+    levels = np.iinfo(colour.dtype).max if np.issubdtype(colour.dtype, np.integer) else 1.0
+    apart, here = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+    each = np.abs(points.colour.astype(np.float32) - colour.astype(np.float32))
+    apart[points.at] = (each if each.ndim == 1 else each.max(axis=-1)) / np.float32(levels)
+    here[points.at] = 1.0
+    count, mean = (cv2.blur(values, (3, 3))[points.at] for values in (here, apart))
+    return np.asarray(mean / np.maximum(count, np.float32(1e-6)) > _DIFFERENT)
 
 
 @compiled(error_model="numpy")
 def _find_in_lines(
-    rho: NDArray[np.float32],
-    wanted: Mask,
+    rho: F32,
+    rows: NDArray[np.intp],
+    places_in_row: NDArray[np.intp],
     maps: LineMaps,
     view_width: int,
     view_height: int,
-    places: NDArray[np.float32],
-    seen_rho: NDArray[np.float32],
+    places: F32,
+    seen_rho: F32,
 ) -> None:
-    """Reproject pixels of the target with inverse depth ``rho`` (H, W) to a rolling-shutter frame.
+    """Reproject pixels of the target with inverse depth ``rho`` (n,) to a rolling-shutter frame.
 
-    Fills ``places`` (H, W, 2), px, and ``seen_rho`` (H, W), the inverse depth there, for ``wanted`` pixels whose
-    points lie inside the frame of ``view_width`` x ``view_height`` pixels. ``maps`` lead to each line's camera.
+    Fills ``places`` (n, 2), px, and ``seen_rho`` (n,), the inverse depth there, for points inside the frame of
+    ``view_width`` x ``view_height`` pixels. ``maps`` lead to each line's camera.
     """
     M, b, columns = maps.M, maps.b, maps.columns
-    height, width = rho.shape
     lines = len(M)
-    for y in range(height):
-        for x in range(width):
-            if not wanted[y, x]:
-                continue
-            gx, gy = look(maps.ideal, x, y)
-            line, u, v, s = min(line_of(columns, x, y), lines - 1), np.nan, np.nan, np.nan
-            for _ in range(_ROW_STEPS):
-                z = M[line, 2, 0] * gx + M[line, 2, 1] * gy + M[line, 2, 2] + rho[y, x] * b[line, 2]
-                s = 1.0 / z if z > 0.0 else np.nan
-                u = (M[line, 0, 0] * gx + M[line, 0, 1] * gy + M[line, 0, 2] + rho[y, x] * b[line, 0]) * s
-                v = (M[line, 1, 0] * gx + M[line, 1, 1] * gy + M[line, 1, 2] + rho[y, x] * b[line, 1]) * s
-                u, v = see(maps.lens, u, v)
-                along = across_lines(columns, u, v)
-                if not -lines < along < 2 * lines:  # NaN included
-                    break
-                line = min(max(int(along + 0.5), 0), lines - 1)
-            if -0.5 < u < view_width - 0.5 and -0.5 < v < view_height - 0.5:
-                places[y, x, 0], places[y, x, 1], seen_rho[y, x] = u, v, rho[y, x] * s
+    for k in range(len(rho)):
+        y, x = rows[k], places_in_row[k]
+        gx, gy = look(maps.ideal, x, y)
+        line, u, v, s = min(line_of(columns, x, y), lines - 1), np.nan, np.nan, np.nan
+        for _ in range(_ROW_STEPS):
+            z = M[line, 2, 0] * gx + M[line, 2, 1] * gy + M[line, 2, 2] + rho[k] * b[line, 2]
+            s = 1.0 / z if z > 0.0 else np.nan
+            u = (M[line, 0, 0] * gx + M[line, 0, 1] * gy + M[line, 0, 2] + rho[k] * b[line, 0]) * s
+            v = (M[line, 1, 0] * gx + M[line, 1, 1] * gy + M[line, 1, 2] + rho[k] * b[line, 1]) * s
+            u, v = see(maps.lens, u, v)
+            along = across_lines(columns, u, v)
+            if not -lines < along < 2 * lines:  # NaN included
+                break
+            line = min(max(int(along + 0.5), 0), lines - 1)
+        if -0.5 < u < view_width - 0.5 and -0.5 < v < view_height - 0.5:
+            places[k, 0], places[k, 1], seen_rho[k] = u, v, rho[k] * s
 
 
 def _warp_into(
-    view: SourceView, holes: Mask, camera: PinholeCamera, target_pose: Pose, options: WarpOptions | None
-) -> Corrected | None:
-    """Warp the part of a view that lies in the holes; None if there is none."""
+    view: SourceView, holes: Mask, camera: PinholeCamera, target_pose: Pose, options: WarpOptions
+) -> _Points:
+    """The pixels of the holes (H, W) that a view shows, without colours."""
     maps = line_maps(camera, view.poses, target_pose, view.columns, view.camera)
     wanted = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8))
     depth = np.zeros_like(view.depth)
     if _keep_landing(view.depth, inverse_depth(view.depth), maps, wanted, depth) == 0:
-        return None
-    return warp(replace(view, depth=depth), camera, target_pose, options=options)
+        source_map, buffer = np.zeros((*holes.shape, 2), dtype=np.float32), np.full(holes.shape, -1.0, np.float32)
+    else:
+        source_map, buffer = drawn(replace(view, depth=depth), camera, target_pose, None, options)
+    at = np.nonzero(holes & (buffer >= 0.0))
+    return _Points(at, depth_of(buffer[at]), source_map[at], np.zeros((len(at[0]), 0)))
 
 
 @compiled(error_model="numpy")
@@ -300,6 +327,8 @@ def _keep_landing(
     count = 0
     for y in range(depth.shape[0]):
         for x in range(depth.shape[1]):
+            if np.isnan(rho[y, x]):
+                continue
             u, v, _ = move(maps, maps.columns, x, y, rho[y, x])
             u, v = u + 0.5, v + 0.5
             if 0.0 <= u < width and 0.0 <= v < height and wanted[int(v), int(u)] != 0:  # NaN is outside

@@ -276,6 +276,9 @@ def reproject_all(rho: F32, lines: NDArray[np.int32], maps: Reprojection, places
     for y in range(height):
         for x in range(width):
             line, u, v, s, along = min(max(lines[y, x], 0), last), np.nan, np.nan, np.nan, np.nan
+            if np.isnan(rho[y, x]):
+                places[y, x, 0], places[y, x, 1], factors[y, x], lines[y, x] = u, v, s, line
+                continue
             p, q, r = _point(x, y, rho[y, x], maps)
             nearest = line
             for _ in range(_STEPS):

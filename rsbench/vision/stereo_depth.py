@@ -72,9 +72,15 @@ def refine_disparity(
     for _ in range(iterations):
         weight, pull, fitted = (np.zeros_like(start) for _ in range(3))
         _in_bands(len(a), lambda y0, y1: _measure(a, b, current, y0, y1, weight, pull))  # noqa: B023
-        _in_bands(len(a), lambda y0, y1: _fit_planes(current, weight, pull, y0, y1, fitted))  # noqa: B023
+        padded = _padded(current, np.nan), _padded(weight, 0.0), _padded(pull, 0.0)
+        _in_bands(len(a), lambda y0, y1: _fit_planes(*padded, y0, y1, fitted))  # noqa: B023
         current = np.clip(fitted, start - np.float32(_FARTHEST), start + np.float32(_FARTHEST))
     return current
+
+
+def _padded(values: F32, beyond: float) -> F32:
+    """Values (H, W) with ``_RADIUS`` more columns on both sides."""
+    return np.pad(values, ((0, 0), (_RADIUS, _RADIUS)), constant_values=beyond)
 
 
 def _in_bands(height: int, work: Callable[[int, int], None]) -> None:
@@ -117,34 +123,45 @@ def _measure(a: F32, b: F32, disparity: F32, first_row: int, end_row: int, weigh
 
 @compiled(error_model="numpy")
 def _fit_planes(disparity: F32, weight: F32, pull: F32, first_row: int, end_row: int, fitted: F32) -> None:
-    """Centre value of the plane fitted to each pixel's window; NaN where the disparity is NaN."""
-    height, width = disparity.shape
+    """Centre value of the plane fitted to each pixel's window; NaN where the disparity is NaN.
+
+    ``disparity``, ``weight`` and ``pull`` have ``_RADIUS`` more columns on both sides, where the disparity is NaN.
+    """
+    height, width = fitted.shape
     line, window = np.zeros((5, width), np.float32), np.zeros((9, width))
     for y in range(first_row, end_row):
+        centre = disparity[y, _RADIUS : _RADIUS + width]
         window[:] = 0.0
         for row in range(max(y - _RADIUS, 0), min(y + _RADIUS + 1, height)):
             line[:] = 0.0
-            for u in range(-_RADIUS, _RADIUS + 1):
-                here, there = slice(max(0, -u), width - max(0, u)), slice(max(0, u), width - max(0, -u))
-                _add_column(
-                    np.float32(u),
-                    disparity[y, here],
-                    disparity[row, there],
-                    weight[row, there],
-                    pull[row, there],
-                    line[0, here],
-                    line[1, here],
-                    line[2, here],
-                    line[3, here],
-                    line[4, here],
+            for first in range(0, 2 * _RADIUS + 1, 3):
+                part, u = slice(first, first + width + 2), np.float32(first - _RADIUS)
+                _add_three(
+                    u,
+                    centre,
+                    disparity[row, part],
+                    weight[row, part],
+                    pull[row, part],
+                    line[0],
+                    line[1],
+                    line[2],
+                    line[3],
+                    line[4],
                 )
             _add_line(float(row - y), line, window)
         for x in range(width):
-            fitted[y, x] = disparity[y, x] + _plane_at_centre(window[:, x])
+            fitted[y, x] = centre[x] + _plane_at_centre(window[:, x])
+
+
+@compiled(error_model="numpy", inline="always")
+def _tap(offset: np.float32, weight: np.float32, pull: np.float32) -> tuple[np.float32, np.float32]:
+    """Weight and weighted measurement of a window pixel: 0 if it is on another surface."""
+    same = abs(offset) <= _SURFACE_STEP
+    return (weight if same else np.float32(0.0)), (weight * offset + pull if same else np.float32(0.0))
 
 
 @compiled(error_model="numpy")
-def _add_column(
+def _add_three(
     u: np.float32,
     centre: F32,
     disparity: F32,
@@ -156,20 +173,21 @@ def _add_column(
     r0: F32,
     ru: F32,
 ) -> None:
-    """Add the window pixel at column offset u of every pixel of a row to its sums of w, w u, w u^2, r and r u.
+    """Add the window pixels at columns u to u + 2 from every pixel of a row to its sums of w, w u, w u^2, r, r u.
 
     The loop over a row is contiguous and has no branch, so that the compiler can vectorise it.
     """
+    one, two = u + np.float32(1.0), u + np.float32(2.0)
     for x in range(len(centre)):
-        offset = disparity[x] - centre[x]
-        same = abs(offset) <= _SURFACE_STEP
-        w = weight[x] if same else np.float32(0.0)
-        r = weight[x] * offset + pull[x] if same else np.float32(0.0)
-        w0[x] += w
-        wu[x] += w * u
-        wuu[x] += w * u * u
-        r0[x] += r
-        ru[x] += r * u
+        here = centre[x]
+        w, r = _tap(disparity[x] - here, weight[x], pull[x])
+        w_1, r_1 = _tap(disparity[x + 1] - here, weight[x + 1], pull[x + 1])
+        w_2, r_2 = _tap(disparity[x + 2] - here, weight[x + 2], pull[x + 2])
+        w0[x] = ((w0[x] + w) + w_1) + w_2
+        wu[x] = ((wu[x] + w * u) + w_1 * one) + w_2 * two
+        wuu[x] = ((wuu[x] + w * u * u) + w_1 * one * one) + w_2 * two * two
+        r0[x] = ((r0[x] + r) + r_1) + r_2
+        ru[x] = ((ru[x] + r * u) + r_1 * one) + r_2 * two
 
 
 @compiled(error_model="numpy")

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -19,7 +20,17 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import SIDES
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.vision.feature_matcher import load_features
-from rsbench.vision.images import ahead, at_full_size, guided_upsample, halved, map_ahead, map_frames, resample
+from rsbench.vision.images import (
+    ahead,
+    at_full_size,
+    guided_upsample,
+    halved,
+    map_ahead,
+    map_frames,
+    resample,
+    resample_at,
+    single_opencv,
+)
 from rsbench.vision.stereo_depth import SgmOptions, depth_metrics, stereo_disparity
 
 Build = Callable[..., Any]
@@ -146,6 +157,20 @@ def test_few_positions_among_many_are_sampled_alike(interpolation: str, share: f
     # Vector instructions may round a sum otherwise than what is left at the end of a row does.
     assert np.max(np.abs(got[wanted].astype(int) - whole[wanted]), initial=0) <= 1
     assert not np.any(got[~wanted])
+
+
+def test_no_points_have_no_values() -> None:
+    image = np.zeros((4, 5, 3), np.uint8)
+    assert resample_at(image, np.zeros((0, 2), np.float32)).shape == (0, 3)
+    assert resample_at(image[..., 0], np.zeros((0, 2), np.float32), "linear").dtype == np.uint8
+
+
+def test_opencv_has_its_threads_back_after_a_fault() -> None:
+    before = cv2.getNumThreads()
+    with pytest.raises(ZeroDivisionError), single_opencv():
+        assert cv2.getNumThreads() == 1
+        raise ZeroDivisionError
+    assert cv2.getNumThreads() == before
 
 
 @pytest.mark.parametrize(("pixels", "at_once"), [(10_000, 4), (2_000_000, 2), (50_000_000, 1)])
