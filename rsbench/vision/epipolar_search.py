@@ -438,7 +438,7 @@ def _mark(rho: F32, wanted: Mask, maps: Reprojection, marks: NDArray[np.uint8]) 
 def _seen_at(x: int, y: int, rho: float, maps: Reprojection) -> tuple[float, float, float]:
     """Place of a pixel in the other frame, and its inverse depth there, for a given inverse depth here."""
     lines = len(maps.A)
-    line, u, v, s = line_of(maps.columns, x, y), np.nan, np.nan, np.nan
+    line, u, v, s = min(line_of(maps.columns, x, y), lines - 1), np.nan, np.nan, np.nan
     for _ in range(6):
         u, v, s = reproject(x, y, rho, line, maps)
         along = across_lines(maps.there, u, v)

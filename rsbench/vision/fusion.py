@@ -190,12 +190,12 @@ def _close_tears(
     """
     rho = _surface_of_both_sides(inverse_depth(depth))
     for view in views:
-        at = np.nonzero((origin == Origin.NOBODY) & np.isfinite(rho))
-        if not len(at[0]):
+        y, x = np.nonzero((origin == Origin.NOBODY) & np.isfinite(rho))
+        if not len(y):
             break
-        places, expected, known = _look_up(view, rho[at], at, camera, target_pose)
+        places, expected, known = _look_up(view, rho[y, x], (y, x), camera, target_pose)
         take = np.isfinite(places[:, 0]) & ~(known * (1.0 - _AGREE) > expected)
-        at = at[0][take], at[1][take]
+        at = y[take], x[take]
         image[at] = resample_at(view.image, places[take], options.interpolation)
         origin[at] = Origin.GUESSED
         with np.errstate(divide="ignore"):  # at infinity
@@ -307,8 +307,8 @@ def _warp_into(
         source_map, buffer = np.zeros((*holes.shape, 2), dtype=np.float32), np.full(holes.shape, -1.0, np.float32)
     else:
         source_map, buffer = drawn(replace(view, depth=depth), camera, target_pose, None, options)
-    at = np.nonzero(holes & (buffer >= 0.0))
-    return _Points(at, depth_of(buffer[at]), source_map[at], np.zeros((len(at[0]), 0)))
+    y, x = np.nonzero(holes & (buffer >= 0.0))
+    return _Points((y, x), depth_of(buffer[y, x]), source_map[y, x], np.zeros((len(y), 0)))
 
 
 @compiled(error_model="numpy")

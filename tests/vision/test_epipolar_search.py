@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,10 @@ import pytest
 from rsbench.components.motion_models import LinearMotion
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.projection import back_project, row_poses, rs_project_near
-from rsbench.core.rig import StereoRig, View
+from rsbench.core.rig import SIDES, StereoRig, View
 from rsbench.core.shutter import Scanning
 from rsbench.vision.epipolar_search import census as census_of
-from rsbench.vision.epipolar_search import depth_from_motion, ones
+from rsbench.vision.epipolar_search import depth_from_motion, ones, stereo_contradicts
 from rsbench.vision.reprojection import reproject_pixels, reprojection_of
 
 Build = Callable[..., Any]
@@ -72,6 +73,28 @@ def test_what_the_other_frame_does_not_confirm_has_no_depth(world: Build, shapes
     nothing = (np.zeros((160, 200), np.float32),) * 2
     found = depth_from_motion(images, nothing, scene.rig, scene.shutter, scene.motion, "left")  # pyrefly: ignore[bad-argument-type]
     assert all(np.mean(depth > 0.0) < 0.02 for depth in found)
+
+
+def test_a_camera_with_fewer_lines_contradicts_wrong_depth_in_all_lines(
+    world: Build, shapes: Any, u8: Any
+) -> None:
+    """The other camera has half the lines: those of the first one are not numbers of its lines."""
+    scene = world((shapes[0]((0.0, 0.1, 1.0), 5.0),))
+    camera = scene.rig.camera
+    small = camera.resized(camera.width // 2, camera.height // 2)
+    rig = StereoRig.of_cameras(camera, small, np.eye(3), (-scene.rig.baseline, 0.0, 0.0))
+    shutter = rig.shutter_of(Scanning(), 0.8)
+    seen = [
+        replace(scene, rig=replace(scene.rig, camera=each)).see(row_poses(rig, shutter, scene.motion, side, 0))
+        for side, each in zip(SIDES, (camera, small), strict=True)
+    ]
+    images, right = (u8(seen[0][0]), u8(seen[1][0])), seen[0][1].astype(np.float32)
+    given: Any = rig, shutter, scene.motion, "left", 0
+    wrong = np.asarray(1.4 * right, dtype=np.float32)
+    found = stereo_contradicts(images, right, wrong, *given)
+    # The first columns are beyond the other image; elsewhere repetitions of the texture hide a few.
+    assert np.all(np.mean(found[:, 40:], axis=1) > 0.8)
+    assert np.mean(stereo_contradicts(images, wrong, right, *given)) < 0.02
 
 
 def test_without_a_translation_there_is_no_depth(world: Build, shapes: Any, u8: Any) -> None:
