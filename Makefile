@@ -4,6 +4,7 @@
 # make test-extras  install rerun-sdk, torch and datasets (1 GB and more), and run the tests that need them
 # make test-gpu   tests of the renderers, on an NVIDIA GPU
 # make attack     kills, failing file operations, damaged inputs, faults for verify: takes hours
+# make bounds     tests of the compiled functions, with a check of every index: 20 minutes
 # make sample     the release's sample of data, build/rsbench-sample.zip
 # make docs       the documentation site, in build/docs; warnings are errors
 # make reference  commands.md and cards.md from the code, tables and pictures of results-*.md from results/
@@ -25,7 +26,7 @@ OURS := import os, sys; from importlib.util import find_spec; \
   sys.exit(None if ours else f"make: $(VENV) {whose}: remove $(VENV) (make clean), and make again")
 SUITABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 
-.PHONY: help demo test test-extras test-gpu attack sample docs reference lock clean here
+.PHONY: help demo test test-extras test-gpu attack bounds sample docs reference lock clean here
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := demo
 
@@ -61,6 +62,11 @@ test-gpu: $(TOOLS)
 
 attack: $(TOOLS)
 	@PYTHONPATH=tests $(BIN)/python -m attack --write docs/explanation/reliability.md
+
+# Compiled functions check no index: one beyond an array reads any memory, and results differ from run to run.
+bounds: $(TOOLS)
+	@NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/build/bounds OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 \
+	  -m "not slow" tests/core tests/components tests/vision tests/capture tests/solvers tests/pipeline tests/verification
 
 sample: $(STAMP)
 	@$(BIN)/python benchmarks/release_sample.py build/rsbench-sample.zip
