@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -562,7 +563,7 @@ class TimedTracks:
             by_ratio = np.hstack([by_ratio[:, :1], factors * by_ratio[:, 1:]])
         return replace(self, ends=ends, by_ratio=by_ratio)
 
-    @property
+    @cached_property
     def span(self) -> tuple[FloatArray, FloatArray]:
         """Times (n,) of the earliest and the latest observation of each track."""
         taus = self.ends[:, 2]

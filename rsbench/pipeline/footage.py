@@ -534,7 +534,7 @@ class FrameSource:
         """The video file; None for images."""
         return self._video
 
-    @property
+    @cached_property
     def orientation(self) -> int:
         """EXIF orientation with which the frames, which are read as stored, should be displayed."""
         return self._video.orientation if self._video is not None else _orientation_of(self._files[0])
