@@ -34,7 +34,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from rsbench.components.compiled import compiled
-from rsbench.components.motion_kernels import Vector, apply, coefficients, dot, fill_rotation, plus, times
+from rsbench.components.motion_kernels import Vector, coefficients, dot, plus, times
 from rsbench.core import so3
 from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES
@@ -316,14 +316,13 @@ def blank_views(count: int) -> Views:
 @compiled(error_model="numpy")
 def fill_views(curve: Curve, taus: FloatArray, views: Views) -> None:
     """Compute the poses at times (n,)."""
-    work = np.zeros((5, 3, 3))
     for k in range(len(taus)):
-        fill_view(curve, taus[k], views, k, work)
+        fill_view(curve, taus[k], views, k)
 
 
 @compiled(error_model="numpy")
-def fill_view(curve: Curve, tau: float, views: Views, k: int, work: FloatArray) -> None:
-    """Compute the pose at one time and store it at index ``k``; ``work`` is a buffer (5, 3, 3)."""
+def fill_view(curve: Curve, tau: float, views: Views, k: int) -> None:
+    """Compute the pose at one time and store it at index ``k``."""
     count = len(curve.p)
     place = (tau - curve.first) / curve.interval
     i = min(max(math.floor(place), 0), count - 4)
@@ -339,40 +338,99 @@ def fill_view(curve: Curve, tau: float, views: Views, k: int, work: FloatArray) 
         p, speed = plus(p, b[j], along), plus(speed, rates[j] / curve.interval, along)
     _set(views.p, k, p)
     _set(views.speed, k, speed)
-    _fill_turn(curve, i, b, rates, views, k, work)
+    _fill_turn(curve, i, b, rates, views, k)
+
+
+Matrix = tuple[float, float, float, float, float, float, float, float, float]
+"""Rows of a 3 x 3 matrix one after the other: the compiler keeps them in registers."""
 
 
 @compiled(error_model="numpy")
-def _fill_turn(curve: Curve, i: int, b: Vector, rates: Vector, views: Views, k: int, work: FloatArray) -> None:
+def _fill_turn(curve: Curve, i: int, b: Vector, rates: Vector, views: Views, k: int) -> None:
     """Compute rotation, angular rate and derivatives, from the last factor of R to the first."""
-    before, factor, jacobian, product, by_step = work[0], work[1], work[2], work[3], work[4]
-    turn, spin = views.turn[k], (0.0, 0.0, 0.0)
-    for m in range(3):
-        for n in range(3):
-            before[m, n], turn[3, m, n] = 1.0 if m == n else 0.0, 0.0
+    before, spin = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+    later = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for j in range(2, -1, -1):
-        step, inverse = _row(curve.steps, i + j), curve.inverse_left[i + j]
-        spin = plus(spin, rates[j] / curve.interval, apply(before, step))
+        step, inverse = _row(curve.steps, i + j), _matrix(curve.inverse_left, i + j)
+        x, y, z = step
+        along = (
+            before[0] * x + before[1] * y + before[2] * z,
+            before[3] * x + before[4] * y + before[5] * z,
+            before[6] * x + before[7] * y + before[8] * z,
+        )
+        spin = plus(spin, rates[j] / curve.interval, along)
         phi = times(b[j], step)
-        one, half, sixth, _, _ = coefficients(dot(phi, phi))
-        fill_rotation(phi, 1.0 - half * dot(phi, phi), one, half, factor)
-        fill_rotation(phi, one, half, sixth, jacobian)
-        _multiply(before, jacobian, product)
-        _multiply(product, inverse, by_step)
-        for m in range(3):
-            for n in range(3):
-                turn[j + 1, m, n] += b[j] * by_step[m, n]
-        _multiply_transposed(product, inverse, by_step)
-        for m in range(3):
-            for n in range(3):
-                turn[j, m, n] = -b[j] * by_step[m, n]
-        _multiply(before, factor, product)
-        before, product = product, before  # a copy would add seconds of compilation, for its check of shapes
+        square = dot(phi, phi)
+        one, half, sixth, _, _ = coefficients(square)
+        jacobian = _multiply(before, _rotation(phi, one, half, sixth))
+        _set_matrix(views.turn, k, j + 1, later, b[j], _multiply(jacobian, inverse))
+        later = _scaled(-b[j], _multiply(jacobian, _transposed(inverse)))
+        before = _multiply(before, _rotation(phi, 1.0 - half * square, one, half))
+    _set_matrix(views.turn, k, 0, later, 1.0, before)
+    R = _multiply(before, _matrix(curve.R, i))
     for m in range(3):
         for n in range(3):
-            turn[0, m, n] += before[m, n]
-    _multiply(before, curve.R[i], views.R[k])
+            views.R[k, m, n] = R[3 * m + n]
     _set(views.spin, k, spin)
+
+
+@compiled(error_model="numpy")
+def _rotation(phi: Vector, identity: float, skew: float, outer: float) -> Matrix:
+    """identity I + skew [phi]x + outer phi phi^T."""
+    x, y, z = phi
+    xy, xz, yz = outer * x * y, outer * x * z, outer * y * z
+    return (
+        *(outer * x * x + identity, xy - skew * z, xz + skew * y),
+        *(xy + skew * z, outer * y * y + identity, yz - skew * x),
+        *(xz - skew * y, yz + skew * x, outer * z * z + identity),
+    )
+
+
+@compiled(error_model="numpy")
+def _multiply(a: Matrix, b: Matrix) -> Matrix:
+    return (
+        a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
+        a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
+        a[0] * b[2] + a[1] * b[5] + a[2] * b[8],
+        a[3] * b[0] + a[4] * b[3] + a[5] * b[6],
+        a[3] * b[1] + a[4] * b[4] + a[5] * b[7],
+        a[3] * b[2] + a[4] * b[5] + a[5] * b[8],
+        a[6] * b[0] + a[7] * b[3] + a[8] * b[6],
+        a[6] * b[1] + a[7] * b[4] + a[8] * b[7],
+        a[6] * b[2] + a[7] * b[5] + a[8] * b[8],
+    )
+
+
+@compiled(error_model="numpy")
+def _transposed(a: Matrix) -> Matrix:
+    return a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8]
+
+
+@compiled(error_model="numpy")
+def _scaled(factor: float, a: Matrix) -> Matrix:
+    return (
+        *(factor * a[0], factor * a[1], factor * a[2]),
+        *(factor * a[3], factor * a[4], factor * a[5]),
+        *(factor * a[6], factor * a[7], factor * a[8]),
+    )
+
+
+@compiled(error_model="numpy")
+def _matrix(matrices: FloatArray, i: int) -> Matrix:
+    """Number ``i`` of matrices (n, 3, 3)."""
+    return (
+        *(matrices[i, 0, 0], matrices[i, 0, 1], matrices[i, 0, 2]),
+        *(matrices[i, 1, 0], matrices[i, 1, 1], matrices[i, 1, 2]),
+        *(matrices[i, 2, 0], matrices[i, 2, 1], matrices[i, 2, 2]),
+    )
+
+
+@compiled(error_model="numpy")
+def _set_matrix(out: FloatArray, k: int, j: int, a: Matrix, factor: float, b: Matrix) -> None:
+    """Set a matrix of (n, 4, 3, 3) to a + factor b."""
+    for m in range(3):
+        for n in range(3):
+            out[k, j, m, n] = a[3 * m + n] + factor * b[3 * m + n]
 
 
 @compiled(error_model="numpy")
@@ -383,21 +441,6 @@ def _row(rows: FloatArray, i: int) -> Vector:
 @compiled(error_model="numpy")
 def _set(rows: FloatArray, i: int, value: Vector) -> None:
     rows[i, 0], rows[i, 1], rows[i, 2] = value
-
-
-@compiled(error_model="numpy")
-def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    for m in range(3):
-        for n in range(3):
-            out[m, n] = a[m, 0] * b[0, n] + a[m, 1] * b[1, n] + a[m, 2] * b[2, n]
-
-
-@compiled(error_model="numpy")
-def _multiply_transposed(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """a b^T."""
-    for m in range(3):
-        for n in range(3):
-            out[m, n] = a[m, 0] * b[n, 0] + a[m, 1] * b[n, 1] + a[m, 2] * b[n, 2]
 
 
 _WIDEST = (1.0, 10.0)

@@ -130,7 +130,7 @@ def _scratch(ends: int, size: int, shared: int) -> Scratch:
         np.zeros((ends, 3)),
         np.zeros((3, 3)),
         np.zeros((3, 3)),
-        np.zeros((5, 3, 3)),
+        np.zeros((2, 3, 3)),
         np.zeros((2, 24)),
         np.zeros((3, size)),
         np.zeros((size, size)),
@@ -207,7 +207,7 @@ def _explain(curve: Curve, track: FloatArray, focal: FloatArray, s: Scratch) -> 
     """Estimate the point of a track; returns the squared error, px^2."""
     count = len(track)
     for n in range(count):
-        fill_view(curve, track[n, 2], s.views, n, s.work)
+        fill_view(curve, track[n, 2], s.views, n)
     point = _first_point(track, s)
     for step in range(_POINT_STEPS + 1):
         if step > 0:
@@ -452,12 +452,14 @@ def _fill_block(end: FloatArray, n: int, focal: FloatArray, s: Scratch) -> None:
 @compiled(error_model="numpy")
 def _reduce(s: Scratch, size: int, weight: float, first: int, band: FloatArray, gradient: FloatArray) -> None:
     """Eliminate the point and add the weighted equations (size) to the band from unknown ``first`` on."""
-    Q = s.Q
+    L, x, y, z = s.L, s.Q[0], s.Q[1], s.Q[2]
+    for i in range(size):  # ``_forward``, in loops that the compiler can vectorise
+        x[i] = x[i] / L[0, 0]
     for i in range(size):
-        q = _forward(s.L, (Q[0, i], Q[1, i], Q[2, i]))
-        Q[0, i], Q[1, i], Q[2, i] = q
-    best = _forward(s.L, (s.left[0], s.left[1], s.left[2]))
-    x, y, z = Q[0], Q[1], Q[2]
+        y[i] = (y[i] - L[1, 0] * x[i]) / L[1, 1]
+    for i in range(size):
+        z[i] = (z[i] - L[2, 0] * x[i] - L[2, 1] * y[i]) / L[2, 2]
+    best = _forward(L, (s.left[0], s.left[1], s.left[2]))
     for j in range(size):
         a, b, c = x[j], y[j], z[j]
         gradient[first + j] += weight * (s.g[j] - a * best[0] - b * best[1] - c * best[2])
