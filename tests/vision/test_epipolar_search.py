@@ -75,9 +75,7 @@ def test_what_the_other_frame_does_not_confirm_has_no_depth(world: Build, shapes
     assert all(np.mean(depth > 0.0) < 0.02 for depth in found)
 
 
-def test_a_camera_of_fewer_lines_contradicts_wrong_depth_in_all_lines(
-    world: Build, shapes: Any, u8: Any
-) -> None:
+def test_a_camera_of_fewer_lines_contradicts_wrong_depth_in_all_lines(world: Build, shapes: Any, u8: Any) -> None:
     """The other camera has half the lines: those of the first one are not numbers of its lines."""
     scene = world((shapes[0]((0.0, 0.1, 1.0), 5.0),))
     camera = scene.rig.camera
