@@ -4,7 +4,7 @@
 # make test-extras  install rerun-sdk, torch and datasets (1 GB and more), and run the tests that need them
 # make test-gpu   tests of the renderers, on an NVIDIA GPU
 # make attack     kills, failing file operations, damaged inputs, faults for verify: takes hours
-# make bounds     tests of the compiled functions, with a check of every index: 20 minutes
+# make bounds     tests of the compiled functions, with a check of every index: 5 minutes
 # make sample     the release's sample of data, build/rsbench-sample.zip
 # make docs       the documentation site, in build/docs; warnings are errors
 # make reference  commands.md and cards.md from the code, tables and pictures of results-*.md from results/
