@@ -65,7 +65,7 @@ attack: $(TOOLS)
 
 # Compiled functions check no index: one beyond an array reads any memory, and results differ from run to run.
 bounds: $(TOOLS)
-	@NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/build/bounds OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 \
+	@NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR="$(CURDIR)/build/bounds" OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 \
 	  -m "not slow" tests/core tests/components tests/vision tests/capture tests/solvers tests/pipeline tests/verification
 
 sample: $(STAMP)

@@ -447,7 +447,7 @@ def drawn(
     options: WarpOptions,
 ) -> tuple[F32, F32]:
     """The source pixel (H, W, 2) of each target pixel of ``warp``, and inverse depth (H, W) there: NaN and -1
-    where the frame did not see the target."""
+    where the frame did not see the target. Raises ValueError on other shapes or types."""
     _check(view.image, view.depth, view.camera or camera, view.poses, sky_mask, view.columns)
     maps = line_maps(camera, view.poses, target_pose, view.columns, view.camera)
     rho = inverse_depth(view.depth, sky_mask)

@@ -133,8 +133,8 @@ def _moved(
 ) -> Mask:
     """(H, W) large regions whose consistent flow ends off the curves on which static points move.
 
-    The place by flow must also look clearly more similar: flow has errors too. The flow ``back`` is computed only
-    if there are such regions without it.
+    The place by flow must also look clearly more similar: flow has errors too. ``back`` returns the flow in the
+    other direction, and is called only if there are large regions before they are compared with it.
     """
     far, along = still.far, still.near - still.far
     share = np.sum((flow - far) * along, axis=-1) / np.maximum(np.sum(along * along, axis=-1), np.float32(1e-6))

@@ -263,15 +263,15 @@ def _differ(points: _Points, colour: NDArray[Any], shape: tuple[int, int]) -> Ma
 @compiled(error_model="numpy")
 def _find_in_lines(
     rho: F32,
-    rows: NDArray[np.intp],
-    places_in_row: NDArray[np.intp],
+    ys: NDArray[np.intp],
+    xs: NDArray[np.intp],
     maps: LineMaps,
     view_width: int,
     view_height: int,
     places: F32,
     seen_rho: F32,
 ) -> None:
-    """Reproject pixels of the target with inverse depth ``rho`` (n,) to a rolling-shutter frame.
+    """Reproject pixels (n,) of the target with inverse depth ``rho`` (n,) to a rolling-shutter frame.
 
     Fills ``places`` (n, 2), px, and ``seen_rho`` (n,), the inverse depth there, for points inside the frame of
     ``view_width`` x ``view_height`` pixels. ``maps`` lead to each line's camera.
@@ -279,7 +279,7 @@ def _find_in_lines(
     M, b, columns = maps.M, maps.b, maps.columns
     lines = len(M)
     for k in range(len(rho)):
-        y, x = rows[k], places_in_row[k]
+        y, x = ys[k], xs[k]
         gx, gy = look(maps.ideal, x, y)
         line, u, v, s = min(line_of(columns, x, y), lines - 1), np.nan, np.nan, np.nan
         for _ in range(_ROW_STEPS):

@@ -53,7 +53,7 @@ from rsbench.vision.stereo_matcher import (
     widened,
 )
 
-_RADIUS = 4
+_RADIUS = 4  # a window is three times a whole number wide, see ``_fit_planes``
 _SURFACE_STEP = np.float32(1.5)  # px of disparity between the centre and a window pixel of the same surface
 _PRIOR = np.float32(
     4.0
