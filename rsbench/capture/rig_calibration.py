@@ -14,7 +14,7 @@ the tracks do not determine stays at its prior mean, with the prior's standard d
 
 from __future__ import annotations
 
-import copy
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -22,14 +22,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtri  # scipy.stats takes a second to load
 
+from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
-from rsbench.core.correspondences import BoolArray, Correspondences
-from rsbench.core.rig import SIDES, RigCamera, StereoRig
+from rsbench.core.correspondences import BoolArray, Correspondences, without_lens
+from rsbench.core.epipolar import ray_depths
+from rsbench.core.rig import FRAMES, SIDES, RigCamera, StereoRig
+from rsbench.core.se3 import compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import clustered, larger, variance_factor
 from rsbench.solvers.engine.levenberg_marquardt import Damping, descend
-from rsbench.solvers.engine.packed import Packed, heavy_tailed, inverse_definite, pack
+from rsbench.solvers.engine.packed import Packed, each_term, heavy_tailed, inverse_definite, pack
 from rsbench.solvers.engine.residuals import add_tracks
 from rsbench.solvers.engine.robust_motion import RobustOptions, estimate_motion
 from rsbench.solvers.refined import RefinedSolver
@@ -68,6 +71,15 @@ _CHANCE = 0.001
 """Probability of significant errors of a calibration that is right."""
 _SHARED_PX = 0.03
 """Error, px, that all matches of an image pair have in common."""
+_LINE_STEPS = 5
+_BEYOND, _TRACK_FREEDOM = 10.0, 5.0
+"""Standard deviations beyond which errors are equally bad; degrees of freedom of a track."""
+_LINE_NU, _CONVERGENCES, _SPEEDS = 3.0, np.linspace(-3.0, 3.0, 121), np.geomspace(1e-3, 10.0, 121)
+"""Degrees of freedom of the errors in the comparison of disparities with parallax; convergences, in prior standard
+deviations, and translations, in baselines per pixel of the focal length, that are compared."""
+_APART, _CLEARLY = 0.5, 8.0
+"""Least error of the convergence, prior standard deviations, and least difference of log-likelihoods, with which
+parallax over time contradicts a calibration."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -197,7 +209,8 @@ class _Window:
     """Tracks of one pair of frame times, and the distribution of their errors."""
 
     tracks: FloatArray
-    trust: FloatArray
+    every: FloatArray
+    """(n, 8) all tracks, with outliers."""
     nu: float
     scale: float
 
@@ -227,23 +240,26 @@ def refine_rig(
     Returns:
         The corrected rig; None if no motion explains the tracks.
     """
-    starts = [start]
-    if start[_CONVERGENCE] != 0.0:
-        starts.append(np.where(np.arange(len(ERRORS)) == _CONVERGENCE, 0.0, start))
     search = _Search(windows, rig, shutter, robust or RobustOptions(), seed, motion_model)
-    tried = [search.find_motions(each) for each in starts]
     # Rows hardly determine the convergence; if it is wrong, moving objects may give the motion of most inliers.
-    best = int(np.argmax([agreeing for *_, agreeing in tried]))
-    start, (found, thetas, _) = starts[best], tried[best]
-    if not found:
+    by_parallax = search.convergence(start, float(prior[_CONVERGENCE]))[0]
+    convergences = sorted({float(start[_CONVERGENCE]), 0.0, by_parallax})
+    tried = list[tuple[float, _Problem, _Place]]()
+    for each in convergences:
+        begin = np.where(np.arange(len(ERRORS)) == _CONVERGENCE, each, start)
+        found, thetas, _ = search.find_motions(begin)
+        if found:
+            problem = _Problem(found, search, prior)
+            end = descend(problem, problem.place(begin, thetas), _ITERATIONS, _DAMPING)
+            tried.append((problem.unlikely(end), problem, end))
+    if not tried:
         return None
-    problem = _Problem(found, search, prior)
-    end = descend(problem, problem.place(start, thetas), _ITERATIONS, _DAMPING)
+    _, problem, end = min(tried, key=lambda each: each[0])
     errors = end.errors
     covariance = problem.covariance(end.H, problem.window_gradients(errors, end.thetas))
     if covariance is None:
         return None
-    count = sum(len(each.tracks) for each in found)
+    count = sum(len(each.tracks) for each in problem.windows)
     return FoundRig(
         rig=with_errors(rig, errors),
         shutter=_delayed(shutter, errors),
@@ -291,9 +307,14 @@ def agrees(
     """Whether one step of ``refine_rig`` from errors of 0 does not ``contradict`` the calibration.
 
     This takes a fifth of the time. One step suffices for errors that move rows by a fraction of a pixel: the
-    neglected terms are quadratic in them.
+    neglected terms are quadratic in them. It does not for a convergence at which disparities change their sign, so
+    these are compared with parallax first.
     """
     search = _Search(windows, rig, shutter, robust or RobustOptions(), seed, motion_model)
+    sigma = float(prior[_CONVERGENCE])
+    convergence, gain = search.convergence(np.zeros(len(ERRORS)), sigma)
+    if abs(convergence) > _APART * sigma and gain > _CLEARLY:
+        return False
     found, thetas, _ = search.find_motions(np.zeros(len(ERRORS)))
     if not found:
         return False
@@ -314,6 +335,24 @@ def rows_moved(errors: FloatArray, rig: StereoRig) -> float:
     rays = camera.ideal.unproject(np.stack([x, y], axis=-1).reshape(-1, 2))[:, :2]
     moved = _row_columns(rays) @ np.append(errors[:3], errors[5] - errors[6])
     return camera.fx * float(np.sqrt(np.mean(moved**2)))
+
+
+Line = tuple[FloatArray, FloatArray, FloatArray]
+"""Inverse depths (n,) of points, their standard deviations (n,), and disparities (n,), px."""
+
+
+def _line_loss(line: Line, slope: FloatArray, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Negative log-likelihoods (m,) of lines through points, and slopes (m,) that are more likely.
+
+    Args:
+        slope, offset: (m,) of the disparities by the inverse depths.
+    """
+    x, error, y = (each[:, None] for each in line)
+    variance = 2.0 * _LEAST_NOISE_PX**2 + (slope * error) ** 2
+    square = (y - slope * x - offset) ** 2 / (_LINE_NU * variance)
+    weight = 1.0 / (variance * (1.0 + square))
+    better = np.sum(weight * x * (y - offset), axis=0) / np.maximum(np.sum(weight * x * x, axis=0), 1e-300)
+    return 0.5 * (_LINE_NU + 1.0) * np.sum(np.log1p(square), axis=0), np.maximum(better, 1e-9)
 
 
 class _Search(NamedTuple):
@@ -342,10 +381,68 @@ class _Search(NamedTuple):
             window = self.window(chosen, first, read, theta, result.estimate.noise_px or 0.0)
             if window is None:
                 continue
-            found.append(window)
+            found.append(replace(window, every=matches.tracks))
             thetas.append(theta)
             agreeing += len(chosen)
         return found, thetas, agreeing
+
+    def convergence(self, start: FloatArray, sigma: float) -> tuple[float, float]:
+        """Error of the convergence, rad, that makes disparities proportional to parallax over time, and by how
+        much its log-likelihood exceeds that of 0; both 0 if ``sigma``, of its prior, is 0 or nothing moves.
+
+        The left camera alone gives the inverse depth of each track up to a factor, the window's speed. A wrong
+        convergence adds one disparity to all tracks, so that these lie on a line that misses the origin. A grid of
+        all lines is compared, as local steps do not pass a disparity of 0.
+
+        Args:
+            start: the other errors (8,).
+        """
+        total = np.zeros(len(_CONVERGENCES))
+        rig = with_errors(self.rig, np.where(np.arange(len(ERRORS)) == _CONVERGENCE, 0.0, start))
+        offsets = -rig.camera.fx * sigma * _CONVERGENCES
+        for matches in self.windows if sigma > 0.0 else ():
+            line = self._parallax(matches, rig)
+            if line is None:
+                continue
+            slopes = np.broadcast_to(rig.camera.fx * rig.baseline / _SPEEDS[:, None], (len(_SPEEDS), len(offsets)))
+            losses = [_line_loss(line, slope, offsets)[0] for slope in slopes]
+            slope = slopes[np.argmin(losses, axis=0), 0]
+            for _ in range(_LINE_STEPS):
+                slope = _line_loss(line, slope, offsets)[1]
+            total += np.minimum(np.min(losses, axis=0), _line_loss(line, slope, offsets)[0])
+        total += 0.5 * _CONVERGENCES**2
+        found = int(np.argmin(total))
+        return float(sigma * _CONVERGENCES[found]), float(total[len(total) // 2] - total[found])
+
+    def _parallax(
+        self, matches: Correspondences, rig: StereoRig
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Inverse depth (n,) of tracks in units of one over the translation, its standard deviation (n,), and
+        disparity (n,), px, by the left camera's motion; None if it has none."""
+        tracks, own = matches.tracks[:: max(len(matches.tracks) // _MOST_TRACKS, 1)], rig.about("left")
+        pairs, eye = tracks[:, [0, 1, 4, 5]], rig.sensor("left")
+        solver = RefinedSolver(motion_model=self.motion_model, one_camera=True)
+        rng = np.random.default_rng(self.seed)
+        found = estimate_motion(Correspondences(left=pairs), own, self.shutter, solver, self.robust, rng)
+        estimate, length = found.estimate, float(np.linalg.norm(found.estimate.d))
+        if not (estimate.success and length > 0.0):
+            return None
+        motion = make_motion(self.motion_model, estimate.w, estimate.d / length)
+        ends = pairs[:, :2], pairs[:, 2:]
+        first, second = (
+            own.cam_from_world(motion, self.shutter.pixel_time(end, frame, "left"), "left")
+            for frame, end in zip(FRAMES, ends, strict=True)
+        )
+        pose, x = compose(second, inverse(first)), eye.unproject(ends[0])
+        depth = ray_depths(pose, x, eye.unproject(ends[1]))
+        ahead = np.all(np.where(np.isfinite(depth), depth, -1.0) > 0.0, axis=-1) & found.inliers["left"]
+        rho = 1.0 / depth[ahead, 0]
+        turned, step = (pose.R[ahead] @ x[ahead][..., None])[..., 0], pose.t[ahead]
+        there = turned + rho[:, None] * step
+        speed = rig.camera.fx * np.linalg.norm(step[:, :2] - step[:, 2:] * there[:, :2] / there[:, 2:], axis=1)
+        error = _LEAST_NOISE_PX * np.sqrt(2.0) * np.abs(there[:, 2]) / np.maximum(speed, 1e-9)
+        straight = without_lens(Correspondences(tracks=tracks[ahead]), rig).tracks
+        return rho, error, straight[:, 0] - straight[:, 2]
 
     def window(
         self, tracks: FloatArray, rig: StereoRig, shutter: RollingShutter, theta: FloatArray, noise_px: float
@@ -356,12 +453,18 @@ class _Search(NamedTuple):
         tailed = heavy_tailed(packed, theta, max(noise_px, _LEAST_NOISE_PX))
         if tailed is None:
             return None
-        return _Window(some.tracks, np.ones(len(some.tracks)), tailed.nu, tailed.scale)
+        return _Window(some.tracks, tracks, tailed.nu, tailed.scale)
 
 
 def _delayed(shutter: RollingShutter, errors: FloatArray) -> RollingShutter:
     late = shutter.right_delay + float(errors[_DELAY])
     return shutter if errors[_DELAY] == 0.0 else replace(shutter, right_delay=float(np.clip(late, -1.0, 1.0)))
+
+
+def _unlikely(squares: FloatArray, freedom: FloatArray) -> float:
+    """Negative log-likelihood of squared errors (n,), px^2 per degree of freedom (n,), with heavy tails."""
+    q = squares * freedom / (_LINE_NU * _LEAST_NOISE_PX**2)
+    return 0.5 * float((_LINE_NU + freedom) @ np.log1p(q))
 
 
 class _Place(NamedTuple):
@@ -381,17 +484,31 @@ class _Problem:
     """The cost of all windows by errors and motions, for ``descend``; the motions are eliminated in each step."""
 
     def __init__(self, windows: Sequence[_Window], search: _Search, prior: FloatArray) -> None:
-        self.windows, self.rig, self.shutter, self.model = windows, search.rig, search.shutter, search.motion_model
+        self.windows, self.search = windows, search
         self.prior, self.free = prior, np.flatnonzero(prior > 0.0)
+        ends = np.cumsum([0, *(len(each.tracks) for each in windows)])
+        self._parts = [slice(*each) for each in itertools.pairwise(ends)]
+        self._tracks = Correspondences(tracks=np.concatenate([each.tracks for each in windows]))
 
     def window_gradients(self, errors: FloatArray, thetas: Sequence[FloatArray]) -> FloatArray:
         """(windows, k) gradient of each window's cost by the free errors, with its motion fitted."""
-        out, weight = list[FloatArray](), self.prior[self.free] ** -2.0
-        for window, theta in zip(self.windows, thetas, strict=True):
-            alone = copy.copy(self)
-            alone.windows = [window]
-            out.append(alone.place(errors, [theta]).g - weight * errors[self.free])
-        return np.array(out)
+        weight = self.prior[self.free] ** -2.0
+        pairs = zip(self.windows, thetas, strict=True)
+        places = [_Problem([window], self.search, self.prior).place(errors, [theta]) for window, theta in pairs]
+        return np.array([place.g - weight * errors[self.free] for place in places])
+
+    def unlikely(self, place: _Place) -> float:
+        """Negative logarithm, up to a constant, of the probability of a place by all tracks of all windows, since
+        which of them are outliers depends on the place; those of a window without a motion are."""
+        beyond = _BEYOND * _LEAST_NOISE_PX
+        total = 0.5 * float(np.sum((place.errors[self.free] / self.prior[self.free]) ** 2))
+        windows = self.search.windows
+        count = sum(len(each.tracks) for each in windows) - sum(len(each.every) for each in self.windows)
+        for window, theta in zip(self.windows, place.thetas, strict=True):
+            packed = self._packed(place.errors, Correspondences(tracks=window.every))
+            squares = np.minimum(each_term(packed, theta).squares / packed.freedom, beyond**2)
+            total += _unlikely(squares, packed.freedom)
+        return total + count * _unlikely(np.array([beyond**2]), np.array([_TRACK_FREEDOM]))
 
     def covariance(self, H: FloatArray, window_gradients: FloatArray | None = None) -> FloatArray | None:
         """(8, 8) of the errors from the Hessian of the free ones, 0 of the others; None if it is singular."""
@@ -402,14 +519,14 @@ class _Problem:
             scatter = clustered(window_gradients @ inverse, np.arange(len(window_gradients)))
             inverse = larger(scatter * variance_factor(len(window_gradients) - 1.0, 1), inverse)
         # Errors that all matches have in common do not average out, however many matches there are.
-        inverse = inverse + (_SHARED_PX / self.rig.camera.fx) ** 2 * np.eye(len(inverse))
+        inverse = inverse + (_SHARED_PX / self.search.rig.camera.fx) ** 2 * np.eye(len(inverse))
         known_before = np.minimum(self.prior[self.free] / np.sqrt(np.diagonal(inverse)), 1.0)
         covariance[np.ix_(self.free, self.free)] = inverse * np.outer(known_before, known_before)
         return covariance
 
-    def _packed(self, window: _Window, errors: FloatArray) -> Packed:
-        matches = Correspondences(tracks=window.tracks)
-        return pack(matches, with_errors(self.rig, errors), _delayed(self.shutter, errors), self.model)
+    def _packed(self, errors: FloatArray, tracks: Correspondences | None = None) -> Packed:
+        rig, shutter = with_errors(self.search.rig, errors), _delayed(self.search.shutter, errors)
+        return pack(tracks or self._tracks, rig, shutter, self.search.motion_model)
 
     def place(self, errors: FloatArray, thetas: list[FloatArray]) -> _Place:
         """Negative log-likelihood at errors (8,) and motions, its gradient and Hessian.
@@ -417,29 +534,27 @@ class _Problem:
         The Hessian uses derivatives of rays and times. The gradient is a central difference of the cost, because
         noisy rays in those derivatives would bias the focal lengths, by five standard deviations for 1200 tracks.
         """
-        k = len(self.free)
+        k, packed = len(self.free), self._packed(errors)
         cost, g, H, backs = 0.0, np.zeros(k), np.zeros((k, k)), list[tuple[FloatArray, FloatArray]]()
-        weight = self.prior[self.free] ** -2.0
-        for window, theta in zip(self.windows, thetas, strict=True):
-            packed, size = self._packed(window, errors), 6 + k
-            by = np.zeros((len(packed.tracks), 4, k, 3))
-            rest = packed.focal, packed.baseline, np.array([window.nu, window.scale]), window.trust
+        weight, steps = self.prior[self.free] ** -2.0, _STEP * np.eye(len(ERRORS))[self.free]
+        both = [[self._packed(errors + each).tracks for each in (step, -step)] for step in steps]
+        derivatives = [(ahead[:, :, :3] - behind[:, :, :3]) / (2.0 * _STEP) for ahead, behind in both]
+        all_by = np.stack(derivatives, axis=2)
+        for part, window, theta in zip(self._parts, self.windows, thetas, strict=True):
+            tracks, by, size = packed.tracks[part], all_by[part], 6 + k
+            rest = packed.focal, packed.baseline, np.array([window.nu, window.scale]), np.ones(len(tracks))
             unused = np.zeros(size), np.zeros((size, size))
             gradient, whole = np.zeros(size), np.zeros((size, size))
-            for j, index in enumerate(self.free):
-                step = _STEP * np.eye(len(ERRORS))[index]
-                ahead, behind = (self._packed(window, errors + each).tracks for each in (step, -step))
-                by[:, :, j] = (ahead[:, :, :3] - behind[:, :, :3]) / (2.0 * _STEP)
-                costs = [add_tracks(theta, packed.law, each, by, *rest, *unused) for each in (ahead, behind)]
+            for j, ends in enumerate(both):
+                costs = [add_tracks(theta, packed.law, each[part], by, *rest, *unused) for each in ends]
                 gradient[6 + j] = (costs[0] - costs[1]) / (2.0 * _STEP)
             for j in range(6):
                 step = _STEP * np.eye(6)[j]
                 costs = [
-                    add_tracks(theta + each, packed.law, packed.tracks, by, *rest, *unused)
-                    for each in (step, -step)
+                    add_tracks(theta + each, packed.law, tracks, by, *rest, *unused) for each in (step, -step)
                 ]
                 gradient[j] = (costs[0] - costs[1]) / (2.0 * _STEP)
-            here = add_tracks(theta, packed.law, packed.tracks, by, *rest, np.zeros(size), whole)
+            here = add_tracks(theta, packed.law, tracks, by, *rest, np.zeros(size), whole)
             cost += here / window.scale**2
             gradient, whole = gradient / window.scale**2, whole / window.scale**2
             back = np.linalg.pinv(whole[:6, :6], hermitian=True)

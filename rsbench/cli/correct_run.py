@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -43,7 +43,7 @@ from rsbench.report.corrected_page import (
 from rsbench.storage.videos import ORIENTATIONS, UPRIGHT, upright, write_frames
 from rsbench.vision.corrector import CorrectorEntry, NotCorrectedError, demand_corrected
 from rsbench.vision.correctors import FusionCorrector
-from rsbench.vision.fusion import finished
+from rsbench.vision.fusion import Fused, finished
 from rsbench.vision.images import single_opencv
 
 _MOST_LISTED = 8
@@ -116,6 +116,28 @@ def listed(frames: Iterable[tuple[int, str]]) -> str:
     return "; ".join(words[:_MOST_LISTED] + more)
 
 
+def alone_of(frames: Mapping[Any, Fused]) -> dict[str, Any]:
+    """For motion.json: how frames were corrected that the motion of the rig does not explain; empty if it does."""
+    noted = {str(view if isinstance(view, str) else f"{view[0]}_{view[1]}"): each for view, each in frames.items()}
+    notes = {name: each.note for name, each in noted.items() if each.note}
+    return notes and {"explained": min(each.explained for each in noted.values() if each.note), **notes}
+
+
+def _say_alone(alone: Mapping[Any, Mapping[str, Any]]) -> None:
+    """Name the frames (number or view) that the motion of the rig does not explain."""
+    if not alone:
+        return
+    least = min(each["explained"] for each in alone.values())
+    names = [str(each) for each in alone]
+    more = f" and {len(names) - _MOST_LISTED} more, see motion.json" if len(names) > _MOST_LISTED else ""
+    echo(
+        f"rsbench: corrected by each camera alone: frame {', '.join(names[:_MOST_LISTED])}{more}: the motion of "
+        f"the rig explains only {100.0 * least:.0f} % of what moves in the images: objects move, or calibration "
+        "or readout_ratio are wrong",
+        err=True,
+    )
+
+
 _PAGE_FRAMES = 6
 
 
@@ -163,6 +185,7 @@ def _correct_four(given: CorrectInput, target: str, options: CorrectionOptions, 
         record = results.capture_record(known, options)
         record["motion"] = None if result.found is None else results.motion_record(result.found)
         record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}
+        record["alone"] = alone_of(result.frames)
         record["seconds"] = result.seconds
         results.write_record(folder, record)
         cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in frames.items()]
@@ -184,6 +207,7 @@ def _say_four(out: Path, first: str, record: dict[str, Any]) -> None:
         if motion["note"]:
             echo(f"note: {motion['note']}")
     echo(f"report: {(out / 'report.html').resolve()}")
+    _say_alone({name.replace("_", " "): record["alone"] for name in record["alone"] if name != "explained"})
 
 
 def _correct_sequence(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
@@ -320,6 +344,8 @@ def _write(
         if given.rectify:
             write_rectified(folder, name, fused, known.rig, side)
         entry |= fused.shares() if given.one_camera else {side: fused.shares()}
+    if alone := alone_of(moment.frames):
+        entry["alone"] = alone
     if moment.reason:
         entry["skipped" if moment.frames else "reason"] = moment.reason
     if moment.frames and moment.found is not None:
@@ -440,6 +466,7 @@ def _say(given: CorrectInput, known: KnownCapture, record: dict[str, Any], lines
     if len(used) < len(gyros):
         unlike = listed((number, found) for number, found in gyros if isinstance(found, str))
         echo(f"rsbench: corrected without the gyroscope: {unlike}", err=True)
+    _say_alone({frame["number"]: frame["alone"] for frame in frames if "alone" in frame})
     if skipped:
         how = "the frame after them" if one else "the motion of the frames around"
         echo(f"rsbench: corrected with {how}: {skipped}", err=True)

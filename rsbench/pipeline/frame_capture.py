@@ -6,7 +6,7 @@ depth and corrected frames are then functions of frames, this object and options
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -107,12 +107,12 @@ def know_four(
         if matches is None:
             matches, doubt = match_given(images, rig, options, inputs)
         if check and doubt is None and not rig.aligned and inputs.calibration is None:
-            found = rig_of_matches(matches, rig, inputs, options)
+            found = rig_of_matches([matches], rig, inputs, options)
         return known(matches, found, doubt)
     except RefusedFramesError as refusal:
         if refusal.stereo is None or not check or not rig.rows_together(inputs.reading, inputs.readout_ratio):
             raise
-        found, matches = find_rig(images, rig, inputs, options, refusal)
+        found, (matches,) = find_rig([images], rig, inputs, options, refusal)
     return known(matches, found)
 
 
@@ -265,11 +265,16 @@ def with_enough(options: CorrectionOptions, tracks: int) -> CorrectionOptions:
 
 
 def find_rig(
-    images: Images, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions, refusal: RefusedFramesError
-) -> tuple[FoundRig, Correspondences]:
+    windows: Iterable[Images],
+    rig: StereoRig,
+    inputs: KnownInputs,
+    options: CorrectionOptions,
+    refusal: RefusedFramesError,
+) -> tuple[FoundRig, list[Correspondences]]:
     """Correct the calibration of a rig that the rows of its frames contradict, and match the frames with it.
 
     Args:
+        windows: pairs of frame times; the first one is that which was refused.
         inputs: given values, with or without a readout ratio.
         refusal: the error with which the frames were refused for ``rig``.
 
@@ -282,13 +287,31 @@ def find_rig(
         raise refusal
     turned = with_errors(rig, rows[0])
     try:
-        matches = match_frames(images, turned, options, inputs.scanning)
+        matches = match_windows(windows, turned, inputs, options)
     except RefusedFramesError:
         raise refusal from None
     found = _refined_rig(matches, rig, rows[0], inputs, options)
     if found is None:
         raise refusal
     return found, matches
+
+
+def match_windows(
+    windows: Iterable[Images], rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
+) -> list[Correspondences]:
+    """Matches of pairs of frame times by ``match_frames``, without later windows that are refused.
+
+    Raises:
+        RefusedFramesError: the first window is refused.
+    """
+    matches = list[Correspondences]()
+    for number, images in enumerate(windows):
+        try:
+            matches.append(match_frames(images, rig, options, inputs.scanning, judge_rig=number == 0))
+        except RefusedFramesError:
+            if not matches:
+                raise
+    return matches
 
 
 _WIDE = 4.0
@@ -298,9 +321,12 @@ _LIKELY_ROWS_PX = 0.3
 
 
 def rig_of_matches(
-    matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
+    windows: Sequence[Correspondences], rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
 ) -> FoundRig | None:
     """Correct a rig by matches along its epipolar lines; None if they agree with its calibration.
+
+    One window is tested first, as it often agrees. Several windows are not: they show smaller errors, of the
+    convergence above all, and it is cheap beside correcting them.
 
     If both cameras read the ends of a match at different times, rows differ by the motion too. Errors are then
     estimated from the tracks alone, if the readout ratio is given.
@@ -309,43 +335,45 @@ def rig_of_matches(
         NoMotionError: the matches do not determine a readout ratio.
     """
     if not rig.rows_together(inputs.reading, inputs.readout_ratio):
-        unknown = inputs.readout_ratio is None or _as_calibrated(matches, rig, inputs, options)
-        found = None if unknown else _rig_of_tracks(matches, rig, inputs, options)
+        unknown = inputs.readout_ratio is None or _as_calibrated(windows, rig, inputs, options)
+        found = None if unknown else _rig_of_tracks(windows, rig, inputs, options)
     else:
-        if not any(known_of(matches, rig, inputs).calibration_sigma):
+        if not any(known_of(windows[0], rig, inputs).calibration_sigma):
             return None
-        ideal = without_lens(matches, rig)
-        rows = rotation_of_rows(np.concatenate([ideal.stereo_0, ideal.stereo_1]), rig, options.seed)
+        ideal = [without_lens(each, rig) for each in windows]
+        ends = np.concatenate([part for each in ideal for part in (each.stereo_0, each.stereo_1)])
+        rows = rotation_of_rows(ends, rig, options.seed)
         if rows is None or (
-            rows_moved(rows[0], rig) < _LIKELY_ROWS_PX and _as_calibrated(matches, rig, inputs, options)
+            rows_moved(rows[0], rig) < _LIKELY_ROWS_PX and _as_calibrated(windows, rig, inputs, options)
         ):
             return None
-        found = _refined_rig(matches, rig, rows[0], inputs, options)
+        found = _refined_rig(windows, rig, rows[0], inputs, options)
     return found if found is not None and found.significant else None
 
 
 def _rig_of_tracks(
-    matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
+    windows: Sequence[Correspondences], rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
 ) -> FoundRig | None:
     """``refine_rig`` without a start from rows: with a wide threshold for outliers, then with the usual one."""
     shutter, prior, found = inputs.shutter_of(rig), prior_of(np.zeros(len(ERRORS))), None
     wide = replace(options.robust, threshold_px=_WIDE * options.robust.threshold_px)
     for robust in (wide, options.robust):
         start = np.zeros(len(ERRORS)) if found is None else found.errors
-        found = refine_rig([matches], rig, shutter, start, prior, robust, options.seed, _model_name(options))
+        found = refine_rig(windows, rig, shutter, start, prior, robust, options.seed, _model_name(options))
         if found is None:
             return None
     return found
 
 
 def _as_calibrated(
-    matches: Correspondences, rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
+    windows: Sequence[Correspondences], rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
 ) -> bool:
-    """Whether the matches agree with the calibration, see ``agrees``; False if the readout ratio is unknown."""
-    if inputs.readout_ratio is None:
+    """Whether the matches of a window agree with the calibration, see ``agrees``; False if the readout ratio is
+    unknown or there are several windows."""
+    if inputs.readout_ratio is None or len(windows) > 1:
         return False
     prior, model = prior_of(np.zeros(len(ERRORS))), _model_name(options)
-    return agrees([matches], rig, inputs.shutter_of(rig), prior, options.robust, options.seed, model)
+    return agrees(windows, rig, inputs.shutter_of(rig), prior, options.robust, options.seed, model)
 
 
 def _model_name(options: CorrectionOptions) -> str:
@@ -353,13 +381,17 @@ def _model_name(options: CorrectionOptions) -> str:
 
 
 def _refined_rig(
-    matches: Correspondences, rig: StereoRig, start: FloatArray, inputs: KnownInputs, options: CorrectionOptions
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    start: FloatArray,
+    inputs: KnownInputs,
+    options: CorrectionOptions,
 ) -> FoundRig | None:
-    """``refine_rig`` with the given shutter, or with the one estimated for the rig with the errors ``start``."""
+    """``refine_rig`` with the given shutter, or the one that the first window shows for the errors ``start``."""
     inputs = replace(inputs, calibration=NO_ERRORS)
-    shutter = know_matches(matches, with_errors(rig, start), inputs, options).shutter
+    shutter = know_matches(windows[0], with_errors(rig, start), inputs, options).shutter
     prior = prior_of(start)
-    return refine_rig([matches], rig, shutter, start, prior, options.robust, options.seed, _model_name(options))
+    return refine_rig(windows, rig, shutter, start, prior, options.robust, options.seed, _model_name(options))
 
 
 def match_given(

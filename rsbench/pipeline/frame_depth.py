@@ -23,6 +23,7 @@ from rsbench.solvers.engine.robust_motion import RobustOptions
 from rsbench.vision.corrector import CorrectorEntry, load_corrector
 from rsbench.vision.epipolar_search import depth_from_motion, stereo_contradicts
 from rsbench.vision.feature_matcher import FeatureEntry, load_features
+from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.images import eight_bit
 from rsbench.vision.stereo_depth import SgmMatcher, fill_holes, moving_disparities, sky_mask, timed_depth
 from rsbench.vision.stereo_matcher import (
@@ -93,6 +94,13 @@ class CorrectionOptions:
         values = {name: getattr(self, name) for name in sorted(option.name for option in fields(self))}
         parts = [f"{name}={value.key if isinstance(value, Entry) else value!r}" for name, value in values.items()]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def inpainted(fused: Fused, options: CorrectionOptions) -> Fused:
+    """The frame with its holes filled if the options request it."""
+    if not (options.inpaint and fused.success):
+        return fused
+    return replace(fused, image=inpaint(fused.image, fused.origin == Origin.NOBODY))
 
 
 # Depth of the frames of a rig: from the other camera, sky, from the motion, and guesses for the rest.

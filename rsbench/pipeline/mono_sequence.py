@@ -25,9 +25,8 @@ from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.camera_capture import TOO_FEW
-from rsbench.pipeline.chain import inpainted
 from rsbench.pipeline.footage import check_alike
-from rsbench.pipeline.frame_depth import CorrectionOptions
+from rsbench.pipeline.frame_depth import CorrectionOptions, inpainted
 from rsbench.pipeline.mono_correction import (
     CUT,
     PIXELS,

@@ -35,8 +35,8 @@ from rsbench.pipeline.frame_capture import (
     CAMERA_WINDOWS,
     KnownCapture,
     find_rig,
-    match_frames,
     match_given,
+    match_windows,
     refuse_backwards,
     rig_of_matches,
     with_enough,
@@ -376,20 +376,32 @@ def spread_windows(left: FrameSource, right: FrameSource) -> Iterable[Images]:
     return islice(window_images(left, right), every // 2, None, every)
 
 
+RIG_WINDOWS, RIG_FRAMES = 5, 60
+"""Most windows for the errors of a rig's calibration, and the first frames among which they are evenly spaced."""
+
+
 def with_found_rig(
     rig: StereoRig, left: FrameSource, right: FrameSource, options: CorrectionOptions, inputs: KnownInputs
 ) -> FoundRig | None:
-    """Correct the rig's calibration by the first frames; None if their rows agree with it or are inconclusive."""
-    images, together = next(window_images(left, right)), rig.rows_together(inputs.reading, inputs.readout_ratio)
+    """Correct the rig's calibration by some of the first frames; None if these agree with it or are inconclusive.
+
+    One window is not enough: an object that moves in most of it changes the convergence of the cameras, by which
+    all depths and speeds are too small or too large.
+    """
+    together = rig.rows_together(inputs.reading, inputs.readout_ratio)
     if rig.aligned and not together:
         return None
-    inputs = replace(inputs, calibration=None)
+    every = max((min(left.count, RIG_FRAMES) - 1) // RIG_WINDOWS, 1)
+    windows = islice(window_images(left, right), 0, every * RIG_WINDOWS, every)
+    first, inputs = next(windows), replace(inputs, calibration=None)
     try:
         if rig.aligned:
-            check_rig(images["left", 0], images["right", 0], rig)
+            check_rig(first["left", 0], first["right", 0], rig)
             return None
-        return rig_of_matches(match_frames(images, rig, options, inputs.scanning), rig, inputs, options)
+        matches = match_windows(itertools.chain([first], windows), rig, inputs, options)
+        return rig_of_matches(matches, rig, inputs, options)
     except RefusedFramesError as refusal:
         with suppress(RefusedFramesError, NoMotionError):  # the correction reports refused windows
-            return find_rig(images, rig, inputs, options, refusal)[0] if together else None
+            shown = itertools.chain([first], windows)
+            return find_rig(shown, rig, inputs, options, refusal)[0] if together else None
         return None

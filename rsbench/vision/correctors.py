@@ -7,8 +7,10 @@ time. Their flow does, scaled by the times of the rows, if they move uniformly i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any, NamedTuple, final
 
 import cv2
@@ -19,17 +21,24 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.rig import SIDES, VIEWS, Side, StereoRig, View
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
-from rsbench.vision.correction import WarpOptions, draw_within, inverse_depth, warp_gain
+from rsbench.vision.correction import (
+    WarpOptions,
+    draw_joined,
+    draw_within,
+    inverse_depth,
+    joined_inside,
+    line_maps,
+    move_pixels,
+    warp_gain,
+)
 from rsbench.vision.corrector import CorrectionProblem, Corrector, CorrectorSpec, Depths
-from rsbench.vision.flow import dense_flow, followed, returns_px
+from rsbench.vision.flow import RETURNS_PX, dense_flow, flow_share, followed, leaves, returns_px
 from rsbench.vision.fusion import Fused, Origin, SourceView, fuse
-from rsbench.vision.images import Interpolation, grey_u8, map_frames, resample
-from rsbench.vision.reprojection import reproject_pixels, reprojection_of
+from rsbench.vision.images import Interpolation, grey_u8, local_variance, map_frames, resample
+from rsbench.vision.reprojection import LineMaps, reproject_pixels, reprojection_of
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-_RETURNS_PX = 1.0
-"""Largest distance, px, between a pixel and the end of its flow there and back, for flow that is trusted."""
 _MOVED_PX = 2.0
 """Least distance, px, between the end of the flow and the place of a static point, for a pixel that moved."""
 _DISPARITY_PX = 1.0
@@ -37,41 +46,55 @@ _DISPARITY_PX = 1.0
 _NOISE_LEVELS, _CLEARLY = 1.0, 0.7
 """Difference of grey levels that is always tolerated, and the share of the difference at the place by geometry
 that the place by flow may have."""
-_MEDIAN, _CORE, _NEAR_PX = 9, 9, 12
-"""Sides, px, of the windows in which most or all pixels must move, and distance, px, by which an object is
-extended."""
-_LEAST = 0.004
-"""Least share of the image's area: smaller objects are left to geometry, because errors also occur in such
-spots."""
-_SAME_DEPTH, _SAME_FLOW_PX = 0.06, 3.0
-"""Largest relative difference of inverse depth from the nearest certain pixel of an object, for a pixel that
-belongs to it; and of flow, for a pixel that keeps its own."""
+_AROUND = 1 / 16
+"""Side of the window in which both places are compared, as a share of the image's width."""
+_MEDIAN = 9
+"""Side, px, of the window in which most pixels must move."""
+_LEAST, _SEEN = 0.004, 0.1
+"""Least area in which flow is clearly better, as a share of the image's, since errors also occur in small spots;
+and as a share of the region that then moves along its flow."""
+_TEXTURE_LEVELS, _MOST, _FEW = 4.0, 0.95, 0.01
+"""Least standard deviation of grey levels around a pixel whose flow is trusted, share of such flow on the curves
+that is the most to be expected, and share of the image with such flow below which it says nothing."""
 _EDGE = 7
 """Side, px, of the window whose nearest surface may hide a point: depth has errors at edges."""
 _SMALLEST = 12
 """Least side of an image, px, for dense flow (OpenCV 5.0)."""
 _STRETCH_PX = 2.5
 """Largest distance, px, between neighbours at the target for which the area between them is drawn."""
+_BESIDE_PX, _LITTLE = 12, 0.1
+"""Distance, px, from a moving region up to which flow has a weight, and least weight at which a pixel is moved."""
+_SAME_DEPTH = 0.06
+"""Relative difference of inverse depth that a nearer surface exceeds."""
 _AGREE = 0.03
 """Relative difference of depth below which a moving object lies on a static surface, and is visible."""
 _FLOW_BYTES = 100.0
 
 
 class _Still(NamedTuple):
-    """Motion of static points: (H, W, 2) px, NaN where it is unknown, and (H, W) whether they are hidden there."""
+    """Motion of static points: (H, W, 2) px, NaN where it is unknown, and (H, W) masks."""
 
     far: F32
     """(H, W, 2) displacement, px, of a static point that is somewhat farther."""
     near: F32
     hidden: Mask
     """Whether a nearer surface hides the point, so that the other frame shows another colour there."""
+    unknown: Mask
+    """Whether the point's depth is unknown."""
+
+    def nearest(self, flow: F32) -> F32:
+        """(H, W, 2) displacement, px, between both that is nearest to the ``flow`` (H, W, 2)."""
+        along = self.near - self.far
+        share = np.sum((flow - self.far) * along, axis=-1)
+        share /= np.maximum(np.sum(along * along, axis=-1), np.float32(1e-6))
+        return self.far + np.clip(share, 0.0, 1.0)[..., None] * along
 
 
 class Moving(NamedTuple):
     """Independently moving objects in a frame."""
 
-    mask: Mask
-    """(H, W)."""
+    share: F32
+    """(H, W) weight of the displacement by flow beside that of a static point, 0 to 1; 0 away from the objects."""
     flow: F32
     """(H, W, 2) px, to the other frame of the camera."""
 
@@ -82,11 +105,11 @@ def find_moving(
     poses: Mapping[View, Pose],
     rig: StereoRig,
     shutter: RollingShutter,
-) -> dict[View, Moving]:
-    """Find independently moving objects in four frames (H, W[, 3]), by depth (H, W) and the lines' poses; there
-    may be none.
+) -> tuple[dict[View, Moving], float]:
+    """Find independently moving objects in four frames (H, W[, 3]), by depth (H, W) and the lines' poses.
 
-    In most scenes, half-size frames suffice to exclude them.
+    In most scenes, half-size frames suffice to exclude them. Returns also the share of the flow that the motion of
+    the rig and the depth explain.
     """
     size = max(rig.sensor(side).width * rig.sensor(side).height for side in SIDES)
     grids = {side: rig.sensor(side).pixel_grid().astype(np.float32) for side in SIDES}
@@ -99,7 +122,8 @@ def find_moving(
         lines, rho = np.indices(depth[view].shape, dtype=np.int32)[1 - axis], np.full_like(depth[view], np.nan)
         rho[chosen] = inverse_depth(depth[view][chosen])  # NaN is skipped
         both = np.maximum(rho - np.float32(off), np.float32(0.0)), rho + np.float32(off)
-        ends = [reproject_pixels(maps, each, np.ascontiguousarray(lines)) for each in both]
+        beyond = float(max(camera.width, camera.height))
+        ends = [reproject_pixels(maps, each, np.ascontiguousarray(lines), beyond) for each in both]
         (far, first), (near, second) = ((places[chosen], factors[chosen]) for places, factors in ends)
         there = cv2.dilate(np.nan_to_num(inverse_depth(depth[other])), np.ones((_EDGE, _EDGE), np.uint8))
         farther, nearer = (each[chosen] for each in both)
@@ -107,81 +131,118 @@ def find_moving(
         far, near = np.asarray(far - grid[chosen]), np.asarray(near - grid[chosen])
         ends_at = grid[chosen] + np.asarray((far + near) / 2.0, dtype=np.float32)
         seen = cv2.remap(there, ends_at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        return _Still(far / np.float32(step), near / np.float32(step), np.asarray(seen > before))
+        return _Still(
+            far / np.float32(step), near / np.float32(step), np.asarray(seen > before), np.isnan(rho[chosen])
+        )
 
     first = VIEWS[0]
     half = rig.sensor("left").width // 2, rig.sensor("left").height // 2
     if min(half) < _SMALLEST:
-        return {}
+        return {}, 1.0
     small = [np.asarray(cv2.resize(grey_u8(images[view]), half)) for view in (first, _other(first))]
-    flow = dense_flow(*small)
-    if not np.any(_moved(small, flow, lambda: dense_flow(*small[::-1]), stays(first, 2), 0.5 * _MOVED_PX)):
-        return {}
+    known = small, dense_flow(*small), cache(lambda: dense_flow(*small[::-1])), stays(first, 2), 0.5 * _MOVED_PX
+    explained = _explained(*known)
+    if _evidence(*known) is None:
+        return {}, explained
     both = map_frames(lambda view: dense_flow(images[view], images[_other(view)]), VIEWS, size, _FLOW_BYTES)
     flows, greys = dict(zip(VIEWS, both, strict=True)), {view: grey_u8(images[view]) for view in VIEWS}
 
     def found(view: View) -> Moving:
-        other = _other(view)
-        mask = _moved((greys[view], greys[other]), flows[view], lambda: flows[other], stays(view), _MOVED_PX)
-        return _outlined(Moving(mask, flows[view]), inverse_depth(depth[view]))
+        other, still = _other(view), stays(view)
+        known = (greys[view], greys[other]), flows[view], lambda: flows[other], still, _MOVED_PX
+        evidence = _evidence(*known)
+        share = np.zeros(greys[view].shape, dtype=np.float32)
+        if evidence is not None:
+            miss = np.linalg.norm(flows[view] - still.nearest(flows[view]), axis=-1)
+            off = returns_px(flows[view], flows[other])
+            share = _around(evidence, flow_share(np.nan_to_num(miss, nan=np.inf), off))
+        return Moving(share, flows[view])
 
-    return dict(zip(VIEWS, map_frames(found, VIEWS, size, _FLOW_BYTES), strict=True))
+    return dict(zip(VIEWS, map_frames(found, VIEWS, size, _FLOW_BYTES), strict=True)), explained
 
 
-def _moved(
+def _evidence(
     greys: Sequence[NDArray[np.uint8]], flow: F32, back: Callable[[], F32], still: _Still, least: float
-) -> Mask:
-    """(H, W) large regions whose consistent flow ends off the curves on which static points move.
+) -> Mask | None:
+    """(H, W) pixels whose consistent flow ends off the curves on which static points move, or that would be behind
+    the camera if they were static; None if these make no large region.
 
-    The place by flow must also look clearly more similar: flow has errors too. ``back`` returns the flow in the
-    other direction, and is called only if there are large regions before they are compared with it.
+    Around a pixel, the other frame must also look clearly more similar at the end of the flow than at the place of
+    a static point: flow has errors too. ``back`` returns the flow in the other direction, and is called only if
+    there are large regions before they are compared with it.
     """
-    far, along = still.far, still.near - still.far
-    share = np.sum((flow - far) * along, axis=-1) / np.maximum(np.sum(along * along, axis=-1), np.float32(1e-6))
-    nearest = far + np.clip(share, 0.0, 1.0)[..., None] * along
-    moved = np.linalg.norm(flow - nearest, axis=-1) > least  # False for NaN
-    moved &= ~still.hidden
+    nearest = still.nearest(flow)
+    behind = ~still.unknown & np.isnan(nearest[..., 0])
+    moved = (behind | (np.linalg.norm(flow - nearest, axis=-1) > least)) & ~still.hidden
     if not np.any(_large_regions(moved)[1]):
-        return np.zeros_like(moved)
-    labels, large = _large_regions(moved & (returns_px(flow, back()) < _RETURNS_PX))
-    if not np.any(large):
-        return np.zeros_like(moved)
-    chosen, count = large[labels] & np.isfinite(nearest[..., 0]) & ~still.hidden, len(large)
-    unlike = [np.bincount(labels[chosen], _unlike(greys, each)[chosen], count) for each in (flow, nearest)]
-    large &= unlike[0] + _NOISE_LEVELS * np.bincount(labels[chosen], minlength=count) < _CLEARLY * unlike[1]
-    return np.asarray(large[labels])
+        return None
+    moved &= returns_px(flow, back()) < RETURNS_PX
+    if not np.any(_large_regions(moved)[1]):
+        return None
+    labels, large = _large_regions(moved & _clearly_better(greys, flow, nearest, moved, behind | leaves(nearest)))
+    return np.asarray(large[labels]) if np.any(large) else None
+
+
+def _explained(
+    greys: Sequence[NDArray[np.uint8]], flow: F32, back: Callable[[], F32], still: _Still, least: float
+) -> float:
+    """Share of the consistent flow of textured pixels that ends on the curves on which static points move.
+
+    ``back`` is called only if flow off the curves may be inconsistent.
+    """
+    nearest = still.nearest(flow)
+    on = np.linalg.norm(flow - nearest, axis=-1) <= least  # False for NaN
+    used = (local_variance(greys[0]) > _TEXTURE_LEVELS**2) & ~still.unknown & ~leaves(flow)
+    if np.count_nonzero(on & used) >= _MOST * np.count_nonzero(used):
+        return 1.0
+    used &= returns_px(flow, back()) < 0.5 * RETURNS_PX
+    return float(np.mean(on[used])) if np.count_nonzero(used) > _FEW * used.size else 1.0
+
+
+def _regions(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Labels (H, W) of the regions where most pixels are in a mask (H, W), 0 outside, and their areas (n,)."""
+    dense = cv2.medianBlur(mask.astype(np.uint8), _MEDIAN)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(dense, connectivity=8)
+    return labels, stats[:, cv2.CC_STAT_AREA]
 
 
 def _large_regions(mask: Mask) -> tuple[NDArray[np.int32], Mask]:
-    """Labels (H, W) of regions where most pixels are in a mask (H, W), and whether each label (n,) is a large
-    one."""
-    dense = cv2.medianBlur(mask.astype(np.uint8), _MEDIAN)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(dense, connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] >= _LEAST * mask.size
+    """Labels (H, W) of the regions of a mask (H, W), and whether each label (n,) is a large one."""
+    labels, areas = _regions(mask)
+    large = areas >= _LEAST * mask.size
     large[0] = False
     return labels, large
 
 
-def _unlike(greys: Sequence[NDArray[np.uint8]], flow: F32) -> F32:
-    """(H, W) difference of grey levels between a frame and the other one at the end of ``flow`` (H, W, 2), px."""
-    return np.abs(followed(greys[1], flow, cv2.BORDER_CONSTANT).astype(np.float32) - greys[0])
+def _around(evidence: Mask, share: F32) -> F32:
+    """The weight of flow (H, W) in regions that the ``evidence`` (H, W) shows to move, and beside them; else 0."""
+    labels, areas = _regions(share > 0.5)
+    moves = np.bincount(labels[evidence], minlength=len(areas)) >= _SEEN * areas
+    moves[0] = False
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BESIDE_PX + 1, 2 * _BESIDE_PX + 1))
+    near = cv2.dilate(moves[labels].astype(np.uint8), disc)
+    return np.where(near > 0, share, np.float32(0.0))
 
 
-def _outlined(moving: Moving, rho: F32) -> Moving:
-    """Objects extended to the limits of their own depth, with the flow of nearby pixels: flow extends over
-    edges."""
-    core = cv2.erode(moving.mask.astype(np.uint8), np.ones((_CORE, _CORE), np.uint8)) & np.isfinite(rho)
-    if not np.any(core):
-        return Moving(np.zeros_like(moving.mask), moving.flow)
-    apart, label = cv2.distanceTransformWithLabels(1 - core, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    y, x = np.nonzero(core)
-    at = np.zeros((label.max() + 1, 2), dtype=np.intp)
-    at[label[y, x]] = np.stack([y, x], axis=-1)
-    v, u = np.moveaxis(at[label], -1, 0)
-    beside, flow = rho[v, u], moving.flow[v, u]
-    mask = (apart <= _NEAR_PX) & (np.abs(rho - beside) <= _SAME_DEPTH * beside)
-    own = moving.mask & (np.linalg.norm(moving.flow - flow, axis=-1) <= _SAME_FLOW_PX)
-    return Moving(np.asarray(mask), np.where(own[..., None], moving.flow, flow))
+def _clearly_better(
+    greys: Sequence[NDArray[np.uint8]], flow: F32, still: F32, judged: Mask, outside: Mask
+) -> Mask:
+    """(H, W) whether in the ``judged`` pixels (H, W) around one, ``flow`` (H, W, 2), px, leads to a place that
+    looks clearly more similar than that of ``still``; if that is ``outside`` (H, W), than the mean around it."""
+    window = (round(_AROUND * flow.shape[1]) | 1,) * 2
+    weight = judged.astype(np.float32)
+    there = _unlike(greys, np.nan_to_num(still), window)
+    plain = greys[0].astype(np.float32)
+    there[outside] = np.abs(plain - cv2.blur(plain, window))[outside]
+    means = [cv2.blur(each * weight, window) for each in (_unlike(greys, flow, window), there)]
+    return np.asarray(means[0] + _NOISE_LEVELS * cv2.blur(weight, window) < _CLEARLY * means[1])
+
+
+def _unlike(greys: Sequence[NDArray[np.uint8]], flow: F32, window: tuple[int, int]) -> F32:
+    """(H, W) difference of grey levels between a frame and the other one at the end of ``flow`` (H, W, 2), px,
+    less its mean in the window: smooth surfaces show neither their place nor their brightness."""
+    apart = followed(greys[1], flow, cv2.BORDER_REPLICATE).astype(np.float32) - greys[0]
+    return np.asarray(np.abs(apart - cv2.blur(apart, window)))
 
 
 def draw_moving(
@@ -189,6 +250,7 @@ def draw_moving(
     image: NDArray[Any],
     moving: Moving,
     depth: F32,
+    maps: LineMaps,
     view: View,
     shutter: RollingShutter,
     target_tau: float,
@@ -198,27 +260,34 @@ def draw_moving(
 
     Args:
         fused: the frame without them, see ``find_moving``.
-        image, depth: (H, W[, 3]), (H, W) of the frame of the ``view``.
+        image, depth: (H, W[, 3]), (H, W) of the frame of the ``view``; depth includes guesses.
         moving: the objects in that frame.
+        maps: of the frame's lines to the target.
         target_tau: time of the corrected frame, frame periods.
     """
-    mask = moving.mask & (depth > 0.0)
+    mask = moving.share > _LITTLE
     if not np.any(mask):
         return fused
-    y, x = np.nonzero(mask)
-    here = np.stack([x, y], axis=-1).astype(np.float64)
-    flow = moving.flow[y, x]
-    start = shutter.pixel_time(here, view[1], view[0])
-    passed = shutter.pixel_time(here + flow, 1 - view[1], view[0]) - start
+    rho = np.nan_to_num(inverse_depth(depth))
+    moved = np.zeros((3, *mask.shape))
+    move_pixels(rho, maps, moved)
+    here = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float64) for n in mask.shape[::-1])))
+    flow, share = np.moveaxis(moving.flow, -1, 0), moving.share
+    start = shutter.pixel_time(np.moveaxis(here, 0, -1), view[1], view[0])
+    passed = shutter.pixel_time(np.moveaxis(here + flow, 0, -1), 1 - view[1], view[0]) - start
     with np.errstate(divide="ignore", invalid="ignore"):  # flow between equal times has no speed, and is not drawn
-        share = (target_tau - start) / passed
-    moved = np.full((*mask.shape, 3), np.nan)
-    moved[y, x, :2] = here + share[:, None] * flow
-    moved[y, x, 2] = inverse_depth(depth)[y, x]
-    source_map, buffer = draw_within(moved, _STRETCH_PX)
+        moved[:2] = share * (here + (target_tau - start) / passed * flow) + (1.0 - share) * moved[:2]
+    moved[:, ~mask] = np.nan
+    places = np.ascontiguousarray(np.moveaxis(moved, 0, -1))
+    source_map, buffer = draw_within(places, _STRETCH_PX)
+    whole, behind = draw_joined(places, joined_inside(mask))
+    # Cracks in an object are closed, but not the gap between two of them.
+    shown = cv2.morphologyEx((buffer >= 0.0).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_EDGE, _EDGE), np.uint8))
+    cracks = (shown > 0) & (buffer < 0.0) & (behind >= 0.0)
+    source_map[cracks], buffer[cracks] = whole[cracks], behind[cracks]
     with np.errstate(divide="ignore", invalid="ignore"):
-        behind = np.where(fused.origin == Origin.NOBODY, np.float32(-1.0), np.float32(1.0) / fused.depth)
-    take = (buffer >= 0.0) & ~(behind * (1.0 - _AGREE) > buffer)
+        there = np.where(fused.origin == Origin.HERE, np.float32(1.0) / fused.depth, np.float32(-1.0))
+    take = (buffer >= 0.0) & ~(there * (1.0 - _AGREE) > buffer)
     drawn = resample(image, source_map, interpolation)
     out, origin, z = fused.image.copy(), fused.origin.copy(), fused.depth.copy()
     out[take], origin[take] = drawn[take], Origin.HERE
@@ -261,9 +330,11 @@ class FusionCorrector(Corrector):
 
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
         poses = {view: problem.row_poses(view) for view in VIEWS}
-        depth, moving = problem.depth or {}, dict[View, Moving]()
+        depth, moving, explained = problem.depth or {}, dict[View, Moving](), math.nan
         if self.moving and depth:
-            moving = find_moving(problem.images, depth, poses, problem.rig, problem.shutter)
+            if problem.guess is not None:
+                depth = {view: np.where(depth[view] > 0.0, depth[view], problem.guess[view]) for view in VIEWS}
+            moving, explained = find_moving(problem.images, depth, poses, problem.rig, problem.shutter)
             problem = _standing(problem, moving) if moving else problem
 
         def corrected(view: View) -> Fused:
@@ -272,12 +343,15 @@ class FusionCorrector(Corrector):
             fused = fuse(sources, problem.rig.sensor(view[0]), problem.target_pose(view), self.warp)
             if not moving:
                 return fused
-            tau = float(problem.target_time(view))
-            known = problem.images[view], moving[view], depth[view], view, problem.shutter, tau
-            return draw_moving(fused, *known, self.warp.interpolation)
+            camera, columns = problem.rig.sensor(view[0]), problem.shutter.axis(view[0]) == 0
+            maps = line_maps(camera, poses[view], problem.target_pose(view), columns)
+            known = problem.images[view], moving[view], depth[view], maps, view, problem.shutter
+            return draw_moving(fused, *known, float(problem.target_time(view)), self.warp.interpolation)
 
         pixels = max(image.shape[0] * image.shape[1] for image in problem.images.values())
-        found = map_frames(corrected, views, pixels, _FUSION_BYTES)
+        found = [
+            replace(each, explained=explained) for each in map_frames(corrected, views, pixels, _FUSION_BYTES)
+        ]
         return dict(zip(views, found, strict=True))
 
     def _sources(self, problem: CorrectionProblem, view: View, poses: Mapping[View, Pose]) -> list[SourceView]:
@@ -319,7 +393,7 @@ def _standing(problem: CorrectionProblem, moving: Mapping[View, Moving]) -> Corr
     def still(depth: Depths | None) -> Depths | None:
         if depth is None:
             return None
-        return {view: np.where(moving[view].mask, np.float32(0.0), depth[view]) for view in VIEWS}
+        return {view: np.where(moving[view].share > 0.5, np.float32(0.0), depth[view]) for view in VIEWS}
 
     return replace(problem, depth=still(problem.depth), guess=still(problem.guess))
 

@@ -53,6 +53,39 @@ def returns_px(flow: F32, back: F32) -> F32:
     return np.asarray(np.linalg.norm(flow + there, axis=-1), dtype=np.float32)
 
 
+def leaves(flow: F32) -> NDArray[np.bool_]:
+    """(H, W) whether a flow (H, W, 2), px, leads out of the image; False for NaN."""
+    height, width = flow.shape[:2]
+    x, y = np.arange(width) + flow[..., 0], np.arange(height)[:, None] + flow[..., 1]
+    return np.asarray((x < 0.0) | (x > width - 1.0) | (y < 0.0) | (y > height - 1.0))
+
+
+RETURNS_PX = 1.0
+"""Distance, px, between a pixel and the end of the flow there and back, below which the flow is consistent."""
+ON_CURVE_PX = 1.5
+"""Distance, px, between the end of the flow and the epipolar curve, below which the point is static."""
+_SIGMA_PX = 0.3
+"""Standard deviation, px, of the error of flow that passes both checks, on rendered frames."""
+_SMOOTH_PX = 5
+
+
+def flow_share(miss: F32, off: F32, scale: F32 | None = None, least: float = 0.0) -> F32:
+    """Weight (h, w), 0 to 1, of the displacement by flow beside that by geometry: both by their variances.
+
+    Args:
+        miss: (h, w) px by which the flow ends off the place of a static point; it measures the geometry's error.
+        off: (h, w) px by which the flow is inconsistent, see ``returns_px``.
+        scale: (h, w) factors on the flow's variance.
+        least: variance that the geometry has in addition, px^2.
+    """
+    wrong = np.maximum(miss - ON_CURVE_PX, np.float32(0.0))
+    geometry = np.minimum(wrong, np.float32(1e3)) ** 2 + np.float32(least)
+    flow = (np.minimum(off, np.float32(1e3)) / RETURNS_PX) ** 4 + _SIGMA_PX**2
+    flow = flow if scale is None else flow * scale
+    share = (geometry / (geometry + flow)).astype(np.float32)
+    return np.asarray(cv2.blur(cv2.medianBlur(share, 5), (_SMOOTH_PX, _SMOOTH_PX)))
+
+
 def followed(image: NDArray[Any], flow: F32, border: int) -> NDArray[Any]:
     """Values of an image (H, W[, C]) at the ends of a flow (H, W, 2), px; ``border``: OpenCV's mode beyond it."""
     height, width = flow.shape[:2]

@@ -12,6 +12,7 @@ whereas the frame's own edges are as fine as its optics.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -69,6 +70,10 @@ class Fused:
     """(H, W) z in the target camera, metres; inf at infinity, NaN where it is unknown or the origin is NOBODY."""
     reason: str = ""
     """Why the corrector failed for this frame; empty if it succeeded."""
+    explained: float = math.nan
+    """Share of the images' flow that the motion explains; NaN: not examined."""
+    note: str = ""
+    """How the frame was corrected if the motion of the rig does not explain the images; empty if it does."""
 
     @property
     def success(self) -> bool:

@@ -46,7 +46,7 @@ from rsbench.vision.epipolar_search import (
     search_size,
     sweep_frames,
 )
-from rsbench.vision.flow import dense_flow, returns_px
+from rsbench.vision.flow import ON_CURVE_PX, RETURNS_PX, dense_flow, flow_share, leaves, returns_px
 from rsbench.vision.fusion import Fused, Origin, inpaint
 from rsbench.vision.images import grey_u8, map_frames, resample
 from rsbench.vision.reprojection import LineMaps, Reprojection, look, look_between, parallax_gain, reprojection_of
@@ -105,12 +105,6 @@ def _below(rho: F32, most: float) -> F32:
     return out
 
 
-_RETURNS_PX = 1.0
-"""Distance, px, between a pixel and the end of the flow there and back, below which the flow is consistent."""
-_ON_CURVE_PX = 1.5
-"""Distance, px, between the end of the flow and the epipolar curve, below which the point is static."""
-_SIGMA_PX = 0.3
-"""Standard deviation, px, of the error of flow that passes both checks, on rendered frames."""
 _RANGE_QUANTILE, _RANGE_MARGIN, _RANGE_PX = 0.999, 1.5, 2.0
 """Range of the search along the curves around the inverse depths of consistent flow: a factor, and px of
 parallax."""
@@ -123,7 +117,6 @@ _LAWFUL, _DISTRUST = 2.0, 50.0
 """Largest ratio of the flow's median distance from the curve to its median inconsistency with which the motion
 model holds: 0.6 to 1.5 on published pairs that a motion model describes, also with sensor noise and blur, and 6.5
 on one that none describes. And variance of the geometry over the square of the excess, px."""
-_SMOOTH_PX = 5
 _STRETCH = 2.5
 """Distance, px, of neighbours at the target above which the area between them is uncovered by an edge. Between 2
 and 3: on rendered frames 2 gained 0.05 dB over 3, on real ones it lost as much."""
@@ -293,8 +286,10 @@ class MonoFusion:
         gain = parallax_gain(camera, *maps)
         most = max(_range(offs, met, gain), largest_seen(*known, options))
         swept, same = sweep_frames(*known, most, options), _SAME_PX / max(gain, 1e-9)
-        leaves = [_leaves(flow)[np.ix_(*pick)] for flow in self.flows.flow]
-        return [_layer(swept[frame], offs[frame], *met[frame], leaves[frame], shape, same) for frame in FRAMES]
+        ends_outside = [leaves(flow)[np.ix_(*pick)] for flow in self.flows.flow]
+        return [
+            _layer(swept[frame], offs[frame], *met[frame], ends_outside[frame], shape, same) for frame in FRAMES
+        ]
 
     def _drawn(
         self, frame: int, moved: FloatArray, wanted: Mask | None = None
@@ -476,23 +471,14 @@ def _picked(shape: tuple[int, ...], size: tuple[int, int]) -> tuple[NDArray[np.i
 
 def _range(offs: Sequence[F32], met: Sequence[tuple[F32, F32]], gain: float) -> float:
     """Largest inverse depth that is searched."""
-    believed = [
-        rho[(off < _RETURNS_PX) & (miss < _ON_CURVE_PX)] for off, (rho, miss) in zip(offs, met, strict=True)
-    ]
+    believed = [rho[(off < RETURNS_PX) & (miss < ON_CURVE_PX)] for off, (rho, miss) in zip(offs, met, strict=True)]
     known = np.concatenate(believed)
     largest = float(np.quantile(known, _RANGE_QUANTILE)) if known.size else 0.0
     return largest * _RANGE_MARGIN + _RANGE_PX / max(gain, 1e-9)
 
 
-def _leaves(flow: F32) -> Mask:
-    """(H, W) whether a flow (H, W, 2) leads out of the image."""
-    height, width = flow.shape[:2]
-    x, y = np.arange(width) + flow[..., 0], np.arange(height)[:, None] + flow[..., 1]
-    return np.asarray((x < 0.0) | (x > width - 1.0) | (y < 0.0) | (y > height - 1.0))
-
-
 def _layer(
-    swept: Swept, off: F32, rho: F32, miss: F32, leaves: Mask, shape: tuple[int, ...], same: float
+    swept: Swept, off: F32, rho: F32, miss: F32, ends_outside: Mask, shape: tuple[int, ...], same: float
 ) -> _Layer:
     """Depth and weights (H, W) of a frame.
 
@@ -500,20 +486,15 @@ def _layer(
     and ``same`` is a difference of inverse depth.
     """
     full = shape[1::-1]
-    still = (off < _RETURNS_PX) & (miss < _ON_CURVE_PX)
+    still = (off < RETURNS_PX) & (miss < ON_CURVE_PX)
     searched = swept.agrees & ~(still & (np.abs(rho - swept.rho) < same))
     found = continued(np.where(searched, swept.rho, np.where(still, rho, np.float32(np.nan))))
     filled = cv2.resize(cv2.medianBlur(_filled(found), 5), full, interpolation=cv2.INTER_LINEAR)
-    # The distance of consistent flow from the curve measures the error of the geometry.
-    wrong = np.maximum(miss - _ON_CURVE_PX, np.float32(0.0))
     medians = np.median([miss[still], off[still]], axis=1) if np.any(still) else np.zeros(2)
     unexplained = max(float(medians[0] - _LAWFUL * medians[1]), 0.0)
-    geometry = np.minimum(wrong, np.float32(1e3)) ** 2 + np.float32(_DISTRUST * unexplained**2)
-    flow = (np.minimum(off, np.float32(1e3)) / _RETURNS_PX) ** 4 + _SIGMA_PX**2
-    flow = np.where(swept.agrees, flow * _CONFIRMED, flow)
-    share = (geometry / (geometry + flow)).astype(np.float32)
-    share = cv2.blur(cv2.medianBlur(share, 5), (_SMOOTH_PX, _SMOOTH_PX))
-    measured = (np.isfinite(found) | (off < _RETURNS_PX) | leaves).astype(np.uint8)
+    confirmed = np.where(swept.agrees, np.float32(_CONFIRMED), np.float32(1.0))
+    share = flow_share(miss, off, confirmed, _DISTRUST * unexplained**2)
+    measured = (np.isfinite(found) | (off < RETURNS_PX) | ends_outside).astype(np.uint8)
     return _Layer(
         rho=np.asarray(filled),
         flow_share=np.asarray(cv2.resize(share, full, interpolation=cv2.INTER_LINEAR)),

@@ -264,11 +264,14 @@ def land(M: Vector, b: Vector, rho: float, lens: Table) -> tuple[float, float, f
 
 
 @compiled(error_model="numpy")
-def reproject_all(rho: F32, lines: NDArray[np.int32], maps: Reprojection, places: F32, factors: F32) -> None:
+def reproject_all(
+    rho: F32, lines: NDArray[np.int32], maps: Reprojection, beyond: float, places: F32, factors: F32
+) -> None:
     """Fill ``places`` (H, W, 2) px and depth factors (H, W) of all pixels of inverse depth ``rho`` (H, W).
 
-    NaN where the other view does not see the point. ``lines`` (H, W) are those where the search begins and, after
-    it, those where it ended.
+    NaN where the other view does not see the point, not even if it were larger by ``beyond`` px on all sides; its
+    first and last line then see what lies before and after them. ``lines`` (H, W) are those where the search
+    begins and, after it, those where it ended.
     """
     height, width = rho.shape
     A, B, lens, there = maps.A, maps.B, maps.lens, maps.there
@@ -296,14 +299,14 @@ def reproject_all(rho: F32, lines: NDArray[np.int32], maps: Reprojection, places
                 step = beside - line
                 share = (along - line) / (step - (across_lines(there, u2, v2) - along))
                 u, v, s = u + share * (u2 - u), v + share * (v2 - v), s + share * (s2 - s)
-            inside = -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5
+            inside = -0.5 - beyond < u < width - 0.5 + beyond and -0.5 - beyond < v < height - 0.5 + beyond
             places[y, x, 0] = u if inside else np.nan
             places[y, x, 1] = v if inside else np.nan
             factors[y, x] = s if inside else np.nan
 
 
-def reproject_pixels(maps: Reprojection, rho: F32, lines: NDArray[Any]) -> tuple[F32, F32]:
+def reproject_pixels(maps: Reprojection, rho: F32, lines: NDArray[Any], beyond: float = 0.0) -> tuple[F32, F32]:
     """``reproject_all`` into new arrays."""
     places, factors = np.zeros((*rho.shape, 2), np.float32), np.zeros_like(rho)
-    reproject_all(rho, lines, maps, places, factors)
+    reproject_all(rho, lines, maps, beyond, places, factors)
     return places, factors

@@ -139,7 +139,7 @@ def test_cameras_one_above_the_other_correct_their_calibration_by_tracks() -> No
     assert not VERTICAL.rows_together(Scanning(), 0.8)
     for seed in range(3):
         _, matches, given = _vertical_window(300 + seed)
-        found = rig_of_matches(matches, given, GIVEN, OPTIONS)
+        found = rig_of_matches([matches], given, GIVEN, OPTIONS)
         assert found is not None
         turn = found.rig.right_from_left.R @ VERTICAL.right_from_left.R.T
         # Shared errors of 0.03 px of 520 are 0.003 deg an axis; 300 tracks of 0.1 px add as much.
@@ -148,7 +148,7 @@ def test_cameras_one_above_the_other_correct_their_calibration_by_tracks() -> No
             < 0.02
             < np.rad2deg(so3.angle(given.right_from_left.R @ VERTICAL.right_from_left.R.T))
         )
-        assert rig_of_matches(matches, VERTICAL, GIVEN, OPTIONS) is None
+        assert rig_of_matches([matches], VERTICAL, GIVEN, OPTIONS) is None
 
 
 @pytest.mark.slow
@@ -156,7 +156,7 @@ def test_a_motion_is_stated_with_the_errors_of_the_calibration_that_was_found() 
     inside = {True: 0, False: 0}
     for seed in range(20):
         motion, matches, given = _vertical_window(400 + seed)
-        found = rig_of_matches(matches, given, GIVEN, OPTIONS)
+        found = rig_of_matches([matches], given, GIVEN, OPTIONS)
         assert found is not None
         for counted in inside:
             errors = found if counted else None
