@@ -302,3 +302,20 @@ def test_what_one_camera_alone_shows_is_guessed_as_far_as_what_lies_beside_it(ve
     edge = depth[19, 28:32] if vertical else depth[20, [32] * 4]  # along the baseline the farther one
     np.testing.assert_allclose(hole, np.tile(edge, (3, 1)), rtol=0.02)
     assert np.all(guess[np.isfinite(disparity)] == 0.0)
+
+
+def test_frames_that_the_motion_does_not_explain_are_corrected_by_their_own_camera(castle: Sequence) -> None:
+    """None comes out worse than it went in, however wrong the motion is."""
+    images, known = _frames(castle), KnownInputs.of(castle.shutter)
+    wrong = castle.motion.with_endpoint(-3.0 * castle.motion.w, -20.0 * castle.motion.d)
+    right, other = (
+        correct_four(images, castle.rig, known, CorrectionOptions(), given=Given(motion=motion)).frames
+        for motion in (castle.motion, wrong)
+    )
+    for view, fused in other.items():
+        truth = castle.image("gs", *view)
+        assert right[view].note == "" and right[view].explained > 0.9
+        assert fused.note and fused.explained < 0.5
+        assert psnr(fused.image, truth) > psnr(images[view], truth) - 0.2
+        assert np.all(np.isnan(fused.depth))
+    assert any(fused.note == "corrected by its own camera" for fused in other.values())

@@ -269,6 +269,39 @@ def test_a_ball_goes_its_own_flow_and_the_wall_is_seen_beside_it(worlds: tuple[A
     np.testing.assert_array_equal(found[True].image[~rim], found[False].image[~rim])
 
 
+def test_the_explained_share_of_the_flow_shows_a_wrong_motion(worlds: tuple[Any, Any], u8: Any) -> None:
+    """The wall and the right motion explain nearly all flow; the ball does not, and of a wrong motion little is."""
+    wall = worlds[0]
+    seen = {view: wall.rolling(*view) for view in VIEWS}
+    problem = _problem(worlds, u8)
+    still = replace(
+        problem,
+        images={view: u8(image) for view, (image, _) in seen.items()},
+        depth={view: depth.astype(np.float32) for view, (_, depth) in seen.items()},
+    )
+    wrong = replace(still, motion=wall.motion.with_endpoint(wall.motion.w, -40.0 * wall.motion.d))
+    shares = [FusionCorrector().correct(each, [VIEW])[VIEW].explained for each in (still, problem, wrong)]
+    assert shares[0] > 0.98
+    assert 0.5 < shares[1] < shares[0]
+    assert shares[2] < 0.2
+    assert np.isnan(FusionCorrector(moving=False).correct(wrong, [VIEW])[VIEW].explained)
+
+
+def test_a_thing_whose_static_place_is_outside_the_frame_goes_its_own_flow(world: Build, shapes: Any, u8: Any) -> None:
+    """A ball beside a fast rig keeps its place in the image; if it stood still, it would have left the frame."""
+    plane, sphere = shapes
+    fast = {"w_deg": (0.0, 0.0, 0.0), "d": (2.4, 0.0, 0.0)}
+    wall = world((plane((0.0, 0.0, 1.0), 25.0),), **fast, **SIZE)
+    ball = world((sphere((0.4, 0.0, 4.0), 0.8),), w_deg=(0.0, 0.0, 0.0), d=(0.0, 0.04, 0.0), seed=1, **SIZE)
+    problem, tau = _problem((wall, ball), u8), 1.5
+    true, _, on_ball = _both((wall, ball), lambda each: each.still("left", tau))
+    errors = [
+        _rms(FusionCorrector(moving=moving).correct(problem, [VIEW])[VIEW].image, 255.0 * true, on_ball)
+        for moving in (False, True)
+    ]
+    assert errors[1] < 0.5 * errors[0]
+
+
 def test_what_passes_before_a_plain_wall_does_not_set_it_in_motion(world: Build, shapes: Any, u8: Any) -> None:
     """Flow runs from an edge into what has no texture, and fits there: the edge hides where geometry leads."""
     plane, sphere = shapes
