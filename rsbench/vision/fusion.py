@@ -245,7 +245,8 @@ def _look_up(
     own = view.camera or camera
     maps = line_maps(own, target_pose, view.poses, view.columns, camera)
     places, expected = np.full((len(rho), 2), np.nan, dtype=np.float32), np.zeros(len(rho), dtype=np.float32)
-    _find_in_lines(rho, *at, maps, own.width, own.height, places, expected)
+    y, x = (np.ascontiguousarray(each) for each in at)  # compiled for one layout
+    _find_in_lines(rho, y, x, maps, own.width, own.height, places, expected)
     inside, known = np.isfinite(places[:, 0]), np.full(len(rho), np.nan, dtype=np.float32)
     # The frame ends half a pixel beyond the last centre, which may be rounded to the next pixel in float32.
     nearest = np.rint(places[inside]).astype(np.intp)
