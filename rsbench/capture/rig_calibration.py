@@ -24,7 +24,7 @@ from scipy.special import chdtri  # scipy.stats takes a second to load
 
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
-from rsbench.core.correspondences import BoolArray, Correspondences, repeated, without_lens
+from rsbench.core.correspondences import BoolArray, Correspondences, without_lens
 from rsbench.core.epipolar import ray_depths
 from rsbench.core.rig import FRAMES, SIDES, RigCamera, StereoRig
 from rsbench.core.se3 import compose, inverse
@@ -71,9 +71,6 @@ _CHANCE = 0.001
 """Probability of significant errors of a calibration that is right."""
 _SHARED_PX = 0.03
 """Error, px, that all matches of an image pair have in common."""
-_ROW_SHARE, _LEAST_ROW_PX, _NORMAL_QUARTILE = 0.5, 0.1, 0.6745
-"""Weight of left-right matches, as neighbouring ones share errors; their least deviation across rows, px; and the
-median of the absolute value of a standard normal variable."""
 _LINE_STEPS = 5
 _BEYOND, _TRACK_FREEDOM = 10.0, 5.0
 """Standard deviations beyond which errors are equally bad; degrees of freedom of a track."""
@@ -252,7 +249,7 @@ def refine_rig(
         begin = np.where(np.arange(len(ERRORS)) == _CONVERGENCE, each, start)
         found, thetas, _ = search.find_motions(begin)
         if found:
-            problem = _Problem(found, search, prior, search.rows(begin))
+            problem = _Problem(found, search, prior)
             end = descend(problem, problem.place(begin, thetas), _ITERATIONS, _DAMPING)
             tried.append((problem.unlikely(end), problem, end))
     if not tried:
@@ -358,28 +355,6 @@ def _line_loss(line: Line, slope: FloatArray, offset: FloatArray) -> tuple[Float
     return 0.5 * (_LINE_NU + 1.0) * np.sum(np.log1p(square), axis=0), np.maximum(better, 1e-9)
 
 
-class _Rows(NamedTuple):
-    """Row differences (n,), px, of left-right matches, and their derivatives (n, 8) by the errors, at ``errors``.
-
-    They are linear in errors of some tenths of a degree. Of the focal lengths they show the difference alone: what
-    both do together, through the lenses, errors of the lenses do too.
-    """
-
-    errors: FloatArray
-    off: FloatArray
-    slopes: FloatArray
-    scale: float
-    """px, of their t distribution."""
-
-    def terms(self, errors: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Negative log-likelihood at errors (8,), its gradient (8,) and Hessian (8, 8)."""
-        off = self.off + self.slopes @ (errors - self.errors)
-        square = off**2 / (_LINE_NU * self.scale**2)
-        weight = _ROW_SHARE * (_LINE_NU + 1.0) / (_LINE_NU * self.scale**2 * (1.0 + square))
-        cost = 0.5 * _ROW_SHARE * (_LINE_NU + 1.0) * float(np.sum(np.log1p(square)))
-        return cost, self.slopes.T @ (weight * off), (self.slopes.T * weight) @ self.slopes
-
-
 class _Search(NamedTuple):
     """The windows of a rig whose calibration is estimated, and the settings of the search for their motions."""
 
@@ -410,24 +385,6 @@ class _Search(NamedTuple):
             thetas.append(theta)
             agreeing += len(chosen)
         return found, thetas, agreeing
-
-    def rows(self, errors: FloatArray) -> _Rows | None:
-        """Row differences of the left-right matches that no track has, near errors (8,); None if times differ."""
-        if not self.rig.rows_together(self.shutter.scanning, self.shutter.readout_ratio):
-            return None
-        ends = list[FloatArray]()
-        for matches in self.windows:
-            for name, half in (("stereo_0", slice(0, 4)), ("stereo_1", slice(4, 8))):
-                own: FloatArray = getattr(matches, name)
-                ends.append(own[~repeated(own, matches.tracks[:, half])])
-        rig = with_errors(self.rig, errors)
-        straight, camera = without_lens(Correspondences(stereo_0=np.concatenate(ends)), rig).stereo_0, rig.camera
-        if len(straight) < _FEWEST:
-            return None
-        off, slopes = straight[:, 1] - straight[:, 3], np.zeros((len(straight), len(ERRORS)))
-        by = camera.fy * _row_columns((straight[:, 2:] - (camera.cx, camera.cy)) / (camera.fx, camera.fy))
-        slopes[:, :3], slopes[:, 5], slopes[:, 6] = by[:, :3], -by[:, 3], by[:, 3]
-        return _Rows(errors, off, slopes, max(float(np.median(np.abs(off))) / _NORMAL_QUARTILE, _LEAST_ROW_PX))
 
     def convergence(self, start: FloatArray, sigma: float) -> tuple[float, float]:
         """Error of the convergence, rad, that makes disparities proportional to parallax over time, and by how
@@ -526,10 +483,8 @@ class _Place(NamedTuple):
 class _Problem:
     """The cost of all windows by errors and motions, for ``descend``; the motions are eliminated in each step."""
 
-    def __init__(
-        self, windows: Sequence[_Window], search: _Search, prior: FloatArray, rows: _Rows | None = None
-    ) -> None:
-        self.windows, self.search, self.rows = windows, search, rows
+    def __init__(self, windows: Sequence[_Window], search: _Search, prior: FloatArray) -> None:
+        self.windows, self.search = windows, search
         self.prior, self.free = prior, np.flatnonzero(prior > 0.0)
         ends = np.cumsum([0, *(len(each.tracks) for each in windows)])
         self._parts = [slice(*each) for each in itertools.pairwise(ends)]
@@ -553,7 +508,6 @@ class _Problem:
             packed = self._packed(place.errors, Correspondences(tracks=window.every))
             squares = np.minimum(each_term(packed, theta).squares / packed.freedom, beyond**2)
             total += _unlikely(squares, packed.freedom)
-        total += 0.0 if self.rows is None else self.rows.terms(place.errors)[0]
         return total + count * _unlikely(np.array([beyond**2]), np.array([_TRACK_FREEDOM]))
 
     def covariance(self, H: FloatArray, window_gradients: FloatArray | None = None) -> FloatArray | None:
@@ -607,9 +561,6 @@ class _Problem:
             g += gradient[6:] - whole[6:, :6] @ back @ gradient[:6]
             H += whole[6:, 6:] - whole[6:, :6] @ back @ whole[:6, 6:]
             backs.append((back @ gradient[:6], back @ whole[:6, 6:]))
-        if self.rows is not None:
-            of_rows, slope, curvature = self.rows.terms(errors)
-            cost, g, H = cost + of_rows, g + slope[self.free], H + curvature[np.ix_(self.free, self.free)]
         values = errors[self.free]
         cost += 0.5 * float(weight @ values**2)
         return _Place(errors, thetas, cost, g + weight * values, H + np.diag(weight), backs)
