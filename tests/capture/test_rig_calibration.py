@@ -226,8 +226,8 @@ def test_windows_that_pull_apart_state_larger_deviations() -> None:
 
 
 def test_a_convergence_that_turns_disparities_negative_is_found_by_parallax() -> None:
-    """Far points of a short baseline: with this error half of the disparities are below 0, and no local step from 0
-    passes there. Without it the translation comes out several times too long, or in the opposite direction."""
+    """Far points of a short baseline: with this error half of the disparities are below 0, and no local step from
+    0 passes there. Uncorrected, the translation is several times too long, or has the opposite direction."""
     far = StereoRig.of_cameras(
         PinholeCamera.centred(384, 216, 158.0),
         PinholeCamera.centred(384, 216, 158.0),

@@ -28,6 +28,7 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.dataset import corrected_frames
 from rsbench.dataset.corrected_frames import MASK_VALUES
 from rsbench.dataset.sequence import Sequence
+from rsbench.pipeline import chain
 from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.storage.files import read_depth, read_png, write_png
 
@@ -183,6 +184,30 @@ def test_a_sequence_of_folders(tmp_path: Path, frames: list[Path], rig: Path) ->
         sides = [cv2.imread(str(out / "corrected" / f"{side}_{number:06d}.png")) for side in ("left", "right")]
         np.testing.assert_array_equal(video.read()[1], np.hstack(sides))
     assert not video.read()[0] and (tmp_path / "film.json").is_file()
+
+
+def test_frames_that_the_motion_does_not_explain_are_named(
+    tmp_path: Path, frames: list[Path], rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chain, "_CREDIBLE", 2.0)  # more than any motion explains
+    out, words = tmp_path / "out", "rsbench: corrected by each camera alone: frame "
+    result = correct(*frames, "--rig", rig, "--out", out)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr.splitlines()[-1].startswith(
+        words + "left 0, left 1, right 0, right 1: the motion of the rig"
+    )
+    record = _check_outputs(out, ORDER)
+    assert set(record["alone"]) == {"explained", *ORDER}
+    assert not np.any(read_depth(out / "depth" / "left_0.exr"))  # one camera does not know its unit
+    for number, path in enumerate(frames):
+        side = tmp_path / ("left", "right")[number % 2]
+        side.mkdir(exist_ok=True)
+        (side / f"{number // 2}.png").write_bytes(path.read_bytes())
+    given = ("--left", tmp_path / "left", "--right", tmp_path / "right", "--rig", rig)
+    result = correct(*given, "--out", tmp_path / "sequence")
+    assert result.stderr.splitlines()[-1].startswith(words + "0, 1: ")
+    entries = json.loads((tmp_path / "sequence" / "motion.json").read_text("utf-8"))["frames"]
+    assert [set(each["alone"]) for each in entries] == [{"explained", "left", "right"}] * 2
 
 
 @pytest.fixture

@@ -270,7 +270,7 @@ def test_a_ball_goes_its_own_flow_and_the_wall_is_seen_beside_it(worlds: tuple[A
 
 
 def test_the_explained_share_of_the_flow_shows_a_wrong_motion(worlds: tuple[Any, Any], u8: Any) -> None:
-    """The wall and the right motion explain nearly all flow; the ball does not, and of a wrong motion little is."""
+    """The right motion explains nearly all flow of the wall, less with the ball, and a wrong one hardly any."""
     wall = worlds[0]
     seen = {view: wall.rolling(*view) for view in VIEWS}
     problem = _problem(worlds, u8)
@@ -287,7 +287,9 @@ def test_the_explained_share_of_the_flow_shows_a_wrong_motion(worlds: tuple[Any,
     assert np.isnan(FusionCorrector(moving=False).correct(wrong, [VIEW])[VIEW].explained)
 
 
-def test_a_thing_whose_static_place_is_outside_the_frame_goes_its_own_flow(world: Build, shapes: Any, u8: Any) -> None:
+def test_a_thing_whose_static_place_is_outside_the_frame_goes_its_own_flow(
+    world: Build, shapes: Any, u8: Any
+) -> None:
     """A ball beside a fast rig keeps its place in the image; if it stood still, it would have left the frame."""
     plane, sphere = shapes
     fast = {"w_deg": (0.0, 0.0, 0.0), "d": (2.4, 0.0, 0.0)}
