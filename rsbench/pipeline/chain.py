@@ -305,9 +305,10 @@ def correct_known_rows(
     return [{view: inpainted(fused, options) for view, fused in corrected.items()} for corrected in found]
 
 
-_CREDIBLE = 0.8
-"""Least share of the flow that the motion of a rig must explain: it is at least 0.98 on rendered frames, 0.68 to
-0.9 where objects in a quarter of the image move as fast as the rig, and 0.75 to 0.9 on real frames of traffic."""
+_CREDIBLE = 0.9
+"""Least share of the flow beside moving objects that the motion of a rig must explain. It is at least 0.96 on
+rendered frames, with objects in a quarter of the image that move as fast as the rig; 0.93 to 0.99 on real frames
+of slow traffic; and 0.53 to 0.95 on others, of which motion or convergence are wrong."""
 
 
 def _credible(frames: dict[View, Fused], problem: CorrectionProblem) -> dict[View, Fused]:

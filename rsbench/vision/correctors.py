@@ -53,9 +53,10 @@ _MEDIAN = 9
 _LEAST, _SEEN = 0.004, 0.1
 """Least area in which flow is clearly better, as a share of the image's, since errors also occur in small spots;
 and as a share of the region that then moves along its flow."""
-_TEXTURE_LEVELS, _MOST, _FEW = 4.0, 0.95, 0.01
-"""Least standard deviation of grey levels around a pixel whose flow is trusted, share of such flow on the curves
-that is the most to be expected, and share of the image with such flow below which it says nothing."""
+_TEXTURE_LEVELS, _BESIDE, _MOST, _FEW = 4.0, 5, 0.95, 0.01
+"""Least standard deviation of grey levels around a pixel whose flow is trusted; side, px, of the window in which
+it may be on a curve; share of such flow on the curves that is the most to be expected, and share of the image with
+such flow below which it says nothing."""
 _EDGE = 7
 """Side, px, of the window whose nearest surface may hide a point: depth has errors at edges."""
 _SMALLEST = 12
@@ -108,8 +109,8 @@ def find_moving(
 ) -> tuple[dict[View, Moving], float]:
     """Find independently moving objects in four frames (H, W[, 3]), by depth (H, W) and the lines' poses.
 
-    In most scenes, half-size frames suffice to exclude them. Returns also the share of the flow that the motion of
-    the rig and the depth explain.
+    In most scenes, half-size frames suffice to exclude them. Returns also the share of the flow beside such
+    objects that the motion of the rig and the depth explain: if it is small, the motion is wrong.
     """
     size = max(rig.sensor(side).width * rig.sensor(side).height for side in SIDES)
     grids = {side: rig.sensor(side).pixel_grid().astype(np.float32) for side in SIDES}
@@ -141,8 +142,9 @@ def find_moving(
         return {}, 1.0
     small = [np.asarray(cv2.resize(grey_u8(images[view]), half)) for view in (first, _other(first))]
     known = small, dense_flow(*small), cache(lambda: dense_flow(*small[::-1])), stays(first, 2), 0.5 * _MOVED_PX
-    explained = _explained(*known)
-    if _evidence(*known) is None:
+    evidence = _evidence(*known)
+    explained = _explained(*known, evidence)
+    if evidence is None:
         return {}, explained
     both = map_frames(lambda view: dense_flow(images[view], images[_other(view)]), VIEWS, size, _FLOW_BYTES)
     flows, greys = dict(zip(VIEWS, both, strict=True)), {view: grey_u8(images[view]) for view in VIEWS}
@@ -184,15 +186,24 @@ def _evidence(
 
 
 def _explained(
-    greys: Sequence[NDArray[np.uint8]], flow: F32, back: Callable[[], F32], still: _Still, least: float
+    greys: Sequence[NDArray[np.uint8]],
+    flow: F32,
+    back: Callable[[], F32],
+    still: _Still,
+    least: float,
+    evidence: Mask | None,
 ) -> float:
-    """Share of the consistent flow of textured pixels that ends on the curves on which static points move.
+    """Share of the consistent flow of textured pixels that ends on the curves on which static points move, there
+    or beside, since flow extends over edges; without the ``evidence`` (H, W) of objects that move.
 
     ``back`` is called only if flow off the curves may be inconsistent.
     """
     nearest = still.nearest(flow)
-    on = np.linalg.norm(flow - nearest, axis=-1) <= least  # False for NaN
+    on = (np.linalg.norm(flow - nearest, axis=-1) <= least).astype(np.uint8)  # 0 for NaN
+    on = cv2.dilate(on, np.ones((_BESIDE, _BESIDE), np.uint8)) > 0
     used = (local_variance(greys[0]) > _TEXTURE_LEVELS**2) & ~still.unknown & ~leaves(flow)
+    if evidence is not None and 2 * np.count_nonzero(used & evidence) < np.count_nonzero(used):
+        used &= ~evidence  # what moves in most of the image is the rig
     if np.count_nonzero(on & used) >= _MOST * np.count_nonzero(used):
         return 1.0
     used &= returns_px(flow, back()) < 0.5 * RETURNS_PX

@@ -270,7 +270,7 @@ def test_a_ball_goes_its_own_flow_and_the_wall_is_seen_beside_it(worlds: tuple[A
 
 
 def test_the_explained_share_of_the_flow_shows_a_wrong_motion(worlds: tuple[Any, Any], u8: Any) -> None:
-    """The right motion explains nearly all flow of the wall, less with the ball, and a wrong one hardly any."""
+    """The right motion explains nearly all flow beside the ball, and a wrong one hardly any."""
     wall = worlds[0]
     seen = {view: wall.rolling(*view) for view in VIEWS}
     problem = _problem(worlds, u8)
@@ -281,8 +281,7 @@ def test_the_explained_share_of_the_flow_shows_a_wrong_motion(worlds: tuple[Any,
     )
     wrong = replace(still, motion=wall.motion.with_endpoint(wall.motion.w, -40.0 * wall.motion.d))
     shares = [FusionCorrector().correct(each, [VIEW])[VIEW].explained for each in (still, problem, wrong)]
-    assert shares[0] > 0.98
-    assert 0.5 < shares[1] < shares[0]
+    assert min(shares[:2]) > 0.95
     assert shares[2] < 0.2
     assert np.isnan(FusionCorrector(moving=False).correct(wrong, [VIEW])[VIEW].explained)
 
