@@ -2,7 +2,9 @@
 
 Independently moving objects in front of a moving rig are found where flow contradicts geometry. Their depth comes
 from two cameras at one time and is right, but the motion of the rig does not predict their position at another
-time. Their flow does, scaled by the times of the rows, if they move uniformly in the image.
+time. Their flow does, scaled by the times of the rows, if they move uniformly in the image. Around them each
+pixel moves to the mean of both places, weighted by their variances. If flow contradicts geometry in much of the
+image beside them, the motion of the rig is wrong: the share that it explains is returned with the frames.
 """
 
 from __future__ import annotations
