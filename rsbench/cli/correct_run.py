@@ -37,6 +37,7 @@ from rsbench.report.corrected_page import (
     draw_own_motion,
     draw_trajectory,
     most_changed,
+    ranges,
     sizes,
     write_page,
 )
@@ -128,10 +129,9 @@ def _say_alone(alone: Mapping[Any, Mapping[str, Any]]) -> None:
     if not alone:
         return
     least = min(each["explained"] for each in alone.values())
-    names = [str(each) for each in alone]
-    more = f" and {len(names) - _MOST_LISTED} more, see motion.json" if len(names) > _MOST_LISTED else ""
+    names = [each for each in alone if isinstance(each, str)]
     echo(
-        f"rsbench: corrected by each camera alone: frame {', '.join(names[:_MOST_LISTED])}{more}: the motion of "
+        f"rsbench: corrected by each camera alone: frame {', '.join(names) or ranges(list(alone))}: the motion of "
         f"the rig explains only {100.0 * least:.0f} % of what moves in the images: objects move, or calibration "
         "or readout_ratio are wrong",
         err=True,

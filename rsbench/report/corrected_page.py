@@ -236,19 +236,22 @@ def write_page(
         cards=cards,
         trajectory=trajectory,
         video=video,
-        left=_left_alone(record.get("frames", [])),
+        apart=_otherwise(record.get("frames", [])),
         certainty=draw_certainty(_one_motion(record)),
         record=json.dumps(record, indent=1)[:20000],
     )
     write_bytes(page or folder / "report.html", html.encode())
 
 
-def _left_alone(frames: Any) -> list[tuple[str, str]]:
-    """Numbers of the frames that were not corrected, by the reason."""
+_BY_EACH = "corrected by each camera alone: the motion of the rig does not explain the images"
+
+
+def _otherwise(frames: Any) -> list[tuple[str, str]]:
+    """Numbers of the frames that are as they were read, or corrected by each camera alone, by the reason."""
     reasons = dict[str, list[int]]()
     for each in frames if isinstance(frames, list) else []:
-        if "reason" in each:
-            reasons.setdefault(each["reason"], []).append(each["number"])
+        if reason := each.get("reason", _BY_EACH if "alone" in each else ""):
+            reasons.setdefault(reason, []).append(each["number"])
     return [(ranges(numbers), why) for why, numbers in reasons.items()]
 
 

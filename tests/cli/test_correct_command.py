@@ -205,7 +205,7 @@ def test_frames_that_the_motion_does_not_explain_are_named(
         (side / f"{number // 2}.png").write_bytes(path.read_bytes())
     given = ("--left", tmp_path / "left", "--right", tmp_path / "right", "--rig", rig)
     result = correct(*given, "--out", tmp_path / "sequence")
-    assert result.stderr.splitlines()[-1].startswith(words + "0, 1: ")
+    assert result.stderr.splitlines()[-1].startswith(words + "0 to 1: ")
     entries = json.loads((tmp_path / "sequence" / "motion.json").read_text("utf-8"))["frames"]
     assert [set(each["alone"]) for each in entries] == [{"explained", "left", "right"}] * 2
 
