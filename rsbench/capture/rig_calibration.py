@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -247,8 +248,8 @@ def refine_rig(
     tried = list[tuple[float, _Problem, _Place]]()
     for each in convergences:
         begin = np.where(np.arange(len(ERRORS)) == _CONVERGENCE, each, start)
-        found, thetas, _ = search.find_motions(begin)
-        if found:
+        found, thetas = search.find_motions(begin)
+        with suppress(ValueError):  # there are no windows, or a lens shows no ray at a match
             problem = _Problem(found, search, prior)
             end = descend(problem, problem.place(begin, thetas), _ITERATIONS, _DAMPING)
             tried.append((problem.unlikely(end), problem, end))
@@ -315,7 +316,7 @@ def agrees(
     convergence, gain = search.convergence(np.zeros(len(ERRORS)), sigma)
     if abs(convergence) > _APART * sigma and gain > _CLEARLY:
         return False
-    found, thetas, _ = search.find_motions(np.zeros(len(ERRORS)))
+    found, thetas = search.find_motions(np.zeros(len(ERRORS)))
     if not found:
         return False
     problem = _Problem(found, search, prior)
@@ -365,9 +366,9 @@ class _Search(NamedTuple):
     seed: int
     motion_model: str
 
-    def find_motions(self, start: FloatArray) -> tuple[list[_Window], list[FloatArray], int]:
-        """The windows for which a motion is found with given errors (8,), motions, and inlier count."""
-        solver, agreeing = RefinedSolver(motion_model=self.motion_model, use_pairs=False), 0
+    def find_motions(self, start: FloatArray) -> tuple[list[_Window], list[FloatArray]]:
+        """The windows for which a motion is found with given errors (8,), and their motions."""
+        solver = RefinedSolver(motion_model=self.motion_model, use_pairs=False)
         found, thetas = list[_Window](), list[FloatArray]()
         first, read = with_errors(self.rig, start), _delayed(self.shutter, start)
         for matches in self.windows:
@@ -383,8 +384,7 @@ class _Search(NamedTuple):
                 continue
             found.append(replace(window, every=matches.tracks))
             thetas.append(theta)
-            agreeing += len(chosen)
-        return found, thetas, agreeing
+        return found, thetas
 
     def convergence(self, start: FloatArray, sigma: float) -> tuple[float, float]:
         """Error of the convergence, rad, that makes disparities proportional to parallax over time, and by how
@@ -414,9 +414,7 @@ class _Search(NamedTuple):
         found = int(np.argmin(total))
         return float(sigma * _CONVERGENCES[found]), float(total[len(total) // 2] - total[found])
 
-    def _parallax(
-        self, matches: Correspondences, rig: StereoRig
-    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    def _parallax(self, matches: Correspondences, rig: StereoRig) -> Line | None:
         """Inverse depth (n,) of tracks in units of one over the translation, its standard deviation (n,), and
         disparity (n,), px, by the left camera's motion; None if it has none."""
         tracks, own = matches.tracks[:: max(len(matches.tracks) // _MOST_TRACKS, 1)], rig.about("left")
