@@ -311,11 +311,9 @@ def agrees(
     neglected terms are quadratic in them. It does not for a convergence at which disparities change their sign, so
     these are compared with parallax first.
     """
-    search = _Search(windows, rig, shutter, robust or RobustOptions(), seed, motion_model)
-    sigma = float(prior[_CONVERGENCE])
-    convergence, gain = search.convergence(np.zeros(len(ERRORS)), sigma)
-    if abs(convergence) > _APART * sigma and gain > _CLEARLY:
+    if parallax_contradicts(windows, rig, shutter, prior, robust, seed, motion_model):
         return False
+    search = _Search(windows, rig, shutter, robust or RobustOptions(), seed, motion_model)
     found, thetas = search.find_motions(np.zeros(len(ERRORS)))
     if not found:
         return False
@@ -327,6 +325,25 @@ def agrees(
     errors = np.zeros(len(ERRORS))
     errors[problem.free] = -np.linalg.solve(here.H, here.g)
     return not contradict(errors, covariance)
+
+
+def parallax_contradicts(
+    windows: Sequence[Correspondences],
+    rig: StereoRig,
+    shutter: RollingShutter,
+    prior: FloatArray,
+    robust: RobustOptions | None = None,
+    seed: int = 0,
+    motion_model: str = "linear",
+) -> bool:
+    """Whether disparities are clearly not proportional to parallax over time, so that the convergence is wrong.
+
+    Rows hardly show it. The arguments are those of ``agrees``.
+    """
+    search = _Search(windows, rig, shutter, robust or RobustOptions(), seed, motion_model)
+    sigma = float(prior[_CONVERGENCE])
+    convergence, gain = search.convergence(np.zeros(len(ERRORS)), sigma)
+    return abs(convergence) > _APART * sigma and gain > _CLEARLY
 
 
 def rows_moved(errors: FloatArray, rig: StereoRig) -> float:

@@ -119,9 +119,9 @@ def listed(frames: Iterable[tuple[int, str]]) -> str:
 
 def alone_of(frames: Mapping[Any, Fused]) -> dict[str, Any]:
     """For motion.json: how frames were corrected that the motion of the rig does not explain; empty if it does."""
-    noted = {str(view if isinstance(view, str) else f"{view[0]}_{view[1]}"): each for view, each in frames.items()}
-    notes = {name: each.note for name, each in noted.items() if each.note}
-    return notes and {"explained": min(each.explained for each in noted.values() if each.note), **notes}
+    names = {view: view if isinstance(view, str) else "{}_{}".format(*view) for view in frames}
+    notes = {names[view]: each.note for view, each in frames.items() if each.note}
+    return notes and {"explained": min(each.explained for each in frames.values()), **notes}
 
 
 def _say_alone(alone: Mapping[Any, Mapping[str, Any]]) -> None:
@@ -132,8 +132,8 @@ def _say_alone(alone: Mapping[Any, Mapping[str, Any]]) -> None:
     names = [each for each in alone if isinstance(each, str)]
     echo(
         f"rsbench: corrected by each camera alone: frame {', '.join(names) or ranges(list(alone))}: the motion of "
-        f"the rig explains only {100.0 * least:.0f} % of what moves in the images: objects move, or calibration "
-        "or readout_ratio are wrong",
+        f"the rig explains only {100.0 * least:.0f} % of what moves in the images; unless objects fill them, "
+        "check the calibration and readout_ratio",
         err=True,
     )
 

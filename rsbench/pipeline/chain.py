@@ -37,6 +37,7 @@ from rsbench.pipeline.frame_motion import FoundMotion, solve_frames
 from rsbench.pipeline.mono_sequence import correct_frames as correct_own_frames
 from rsbench.pipeline.mono_sequence import options_of_camera
 from rsbench.vision.corrector import CorrectionProblem, find_corrected_rows
+from rsbench.vision.correctors import FusionCorrector
 from rsbench.vision.fusion import Fused
 from rsbench.vision.stereo_matcher import needs_motion, refuse_motion
 
@@ -301,7 +302,9 @@ def correct_known_rows(
         one_time=options.one_time,
     )
     found = find_corrected_rows(options.corrector, problem, views, rows)
-    found = [_credible(each, replace(problem, target_row=row)) for each, row in zip(found, rows, strict=True)]
+    found = [
+        _credible(each, replace(problem, target_row=row), options) for each, row in zip(found, rows, strict=True)
+    ]
     return [{view: inpainted(fused, options) for view, fused in corrected.items()} for corrected in found]
 
 
@@ -311,23 +314,28 @@ rendered frames, with objects in a quarter of the image that move as fast as the
 of slow traffic; and 0.53 to 0.95 on others, of which motion or convergence are wrong."""
 
 
-def _credible(frames: dict[View, Fused], problem: CorrectionProblem) -> dict[View, Fused]:
+def _credible(
+    frames: dict[View, Fused], problem: CorrectionProblem, options: CorrectionOptions
+) -> dict[View, Fused]:
     """The frames; those of a motion that does not explain the images are corrected by each camera alone."""
     return {
-        view: _by_one_camera(problem, view, fused.explained) if fused.explained < _CREDIBLE else fused
+        view: _by_one_camera(problem, view, fused.explained, options) if fused.explained < _CREDIBLE else fused
         for view, fused in frames.items()
     }
 
 
-def _by_one_camera(problem: CorrectionProblem, view: View, explained: float) -> Fused:
+def _by_one_camera(problem: CorrectionProblem, view: View, explained: float, options: CorrectionOptions) -> Fused:
     """A frame corrected by the frames of its own camera, without depth; as read if these cannot be corrected."""
     (side, frame), shutter, camera = view, problem.shutter, problem.rig.sensor(view[0])
     ratio, lines = shutter.ratio_of(side), shutter.lines(side)
     row = float(problem.target_time(view) - shutter.start(frame, side)) * lines / ratio if ratio else 0.0
     own = RollingShutter(height=camera.height, width=camera.width, readout_ratio=ratio, scan=shutter.scan_of(side))
-    images = [problem.images[side, each] for each in FRAMES]
+    images, fill = [problem.images[side, each] for each in FRAMES], True
+    if isinstance(options.corrector.component, FusionCorrector):
+        fill = options.corrector.component.use_other_views
+    by_own = options_of_camera(False, options.seed, row, fill)
     try:
-        moment = list(correct_own_frames(images, camera, own, options_of_camera(False, 0, row)))[frame]
+        moment = list(correct_own_frames(images, camera, own, by_own))[frame]
         found, reason = moment.frames.get("left"), moment.reason
     except RsbenchError as error:
         found, reason = None, str(error)

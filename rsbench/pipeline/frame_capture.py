@@ -21,6 +21,7 @@ from rsbench.capture.rig_calibration import (
     ERRORS,
     FoundRig,
     agrees,
+    parallax_contradicts,
     prior_of,
     refine_rig,
     rotation_of_rows,
@@ -325,8 +326,8 @@ def rig_of_matches(
 ) -> FoundRig | None:
     """Correct a rig by matches along its epipolar lines; None if they agree with its calibration.
 
-    One window is tested first, as it often agrees. Several windows are not: they show smaller errors, of the
-    convergence above all, and it is cheap beside correcting them.
+    If rows or parallax over time contradict the calibration, one window is tested by ``agrees`` before errors are
+    estimated; the errors of several windows are always estimated, and are used if they are significant.
 
     If both cameras read the ends of a match at different times, rows differ by the motion too. Errors are then
     estimated from the tracks alone, if the readout ratio is given.
@@ -338,7 +339,8 @@ def rig_of_matches(
         unknown = inputs.readout_ratio is None or _as_calibrated(windows, rig, inputs, options)
         found = None if unknown else _rig_of_tracks(windows, rig, inputs, options)
     else:
-        if not any(known_of(windows[0], rig, inputs).calibration_sigma):
+        rows_agree = not any(known_of(windows[0], rig, inputs).calibration_sigma)
+        if rows_agree and not _converges_otherwise(windows, rig, inputs, options):
             return None
         ideal = [without_lens(each, rig) for each in windows]
         ends = np.concatenate([part for each in ideal for part in (each.stereo_0, each.stereo_1)])
@@ -374,6 +376,17 @@ def _as_calibrated(
         return False
     prior, model = prior_of(np.zeros(len(ERRORS))), _model_name(options)
     return agrees(windows, rig, inputs.shutter_of(rig), prior, options.robust, options.seed, model)
+
+
+def _converges_otherwise(
+    windows: Sequence[Correspondences], rig: StereoRig, inputs: KnownInputs, options: CorrectionOptions
+) -> bool:
+    """``parallax_contradicts``; False if the readout ratio is unknown."""
+    if inputs.readout_ratio is None:
+        return False
+    prior, model = prior_of(np.zeros(len(ERRORS))), _model_name(options)
+    known = rig, inputs.shutter_of(rig), prior, options.robust, options.seed, model
+    return parallax_contradicts(windows, *known)
 
 
 def _model_name(options: CorrectionOptions) -> str:

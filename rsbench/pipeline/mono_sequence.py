@@ -81,9 +81,12 @@ class _Seen(NamedTuple):
     """Time between the frames, frame periods."""
 
 
-def options_of_camera(inpaint: bool | None, seed: int, target_row: float) -> CorrectionOptions:
-    """Options for the correction of one camera's frames; options for components of a rig have no effect on it."""
-    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=False), seed=seed)
+def options_of_camera(inpaint: bool | None, seed: int, target_row: float, fill: bool = True) -> CorrectionOptions:
+    """Options for the correction of one camera's frames; options for components of a rig have no effect on it.
+
+    With ``fill``, other frames fill holes.
+    """
+    corrector = MonoFusionCorrector(fusion=MonoFusionOptions(inpaint=False, fill=fill), seed=seed)
     entry = replace(load_corrector("mono-fusion"), component=corrector)
     return CorrectionOptions(corrector=entry, target_row=target_row, seed=seed, inpaint=bool(inpaint))
 

@@ -110,7 +110,9 @@ def know_capture(
     left, right = sources
     rig, inputs, shown = card.rig_of(next(iter(left)), next(iter(right))), card.inputs, spread_windows(left, right)
     rig, note = with_found_camera(rig, shown, options, inputs, progress)
-    turned = with_found_rig(rig, left, right, options, inputs)
+    with (no_progress if rig.aligned else progress)("checking the calibration", 1) as advance:
+        turned = with_found_rig(rig, left, right, options, inputs)
+        advance("")
     rig = rig if turned is None else turned.rig
     if not rig.aligned:  # its calibration errors are estimated by ``refine_rig``
         inputs = replace(inputs, calibration=inputs.calibration or NO_ERRORS)
