@@ -60,9 +60,14 @@ def seen(law: Law, points: FloatArray, frame: int, side: int) -> FloatArray:
     return np.where(x[:, 2:] > 0.1, pixels, np.nan)
 
 
-def scattered(law: Law, frame: int, count: int, rng: np.random.Generator) -> FloatArray:
-    """Points (n, 3) 2 to 12 m in front of the left camera."""
-    pixels, z = rng.uniform([0.0, 0.0], [640.0, HEIGHT], (count, 2)), rng.uniform(2.0, 12.0, count)
+NEAR = (2.0, 12.0)
+
+
+def scattered(
+    law: Law, frame: int, count: int, rng: np.random.Generator, depths: tuple[float, float] = NEAR
+) -> FloatArray:
+    """Points (n, 3) at depths, metres, in front of the left camera."""
+    pixels, z = rng.uniform([0.0, 0.0], [640.0, HEIGHT], (count, 2)), rng.uniform(*depths, count)
     R, p = law(times(pixels[:, 1], frame))
     rays = np.concatenate([(pixels - [319.5, 239.5]) / FOCAL, np.ones((count, 1))], axis=1) * z[:, None]
     rays[:, 0] -= 0.5 * BASELINE
@@ -75,12 +80,18 @@ def inside(pixels: FloatArray) -> BoolArray:
 
 
 def matches(
-    law: Law, frames: int, rng: np.random.Generator, outliers: float = 0.2, count: int = 300, noise: float = 0.3
+    law: Law,
+    frames: int,
+    rng: np.random.Generator,
+    outliers: float = 0.2,
+    count: int = 300,
+    noise: float = 0.3,
+    depths: tuple[float, float] = NEAR,
 ) -> tuple[list[Correspondences], list[BoolArray]]:
     """For each two frames, tracks (count, 8) and which of them are right."""
     windows, right = list[Correspondences](), list[BoolArray]()
     for k in range(frames - 1):
-        points = scattered(law, k, 3 * count, rng)
+        points = scattered(law, k, 3 * count, rng, depths)
         tracks = np.concatenate([seen(law, points, k + i // 2, i % 2) for i in range(4)], axis=1)
         tracks = tracks[inside(tracks)][:count]
         tracks = tracks + noise * rng.normal(size=tracks.shape)

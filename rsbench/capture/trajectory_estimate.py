@@ -45,13 +45,22 @@ from rsbench.capture.trajectory_spline import (
     pose_covariance,
     span_of,
 )
-from rsbench.capture.trajectory_tracks import Past, Tails, TimedTracks, informative, pack_windows, thinned
+from rsbench.capture.trajectory_tracks import (
+    Past,
+    Tails,
+    TimedTracks,
+    informative,
+    inverse_depths,
+    pack_windows,
+    thinned,
+)
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import Motion
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
+from rsbench.solvers.refined import LEAST_DEPTHS
 
 _ONE_SIGMA = 0.8413447460685429
 _FIRST_WINDOWS = 8
@@ -209,9 +218,11 @@ class StreamedWindow:
     inliers: BoolArray
     """(n,) which tracks are inliers."""
     covariance: FloatArray | None
-    """(6, 6) covariance of w and d of ``motion``; None if no track spans a period."""
+    """(6, 6) covariance of w and d of ``motion``; None if no track spans a period, or without ``depths``."""
     apart: int
     """Distance, in windows, to the nearest supported window so far; 0: this window is supported."""
+    depths: bool
+    """Whether disparities exceed their noise, so that d has a length."""
     noise_px: float
     gyro: GyroFound | None
     """The current estimates for a gyroscope; None: there is none."""
@@ -355,13 +366,20 @@ class _State:
         right = [found.trust[members][: len(each.tracks)] > 0.0 for members, each in pairs]
         own = [self.first + k for k, each in enumerate(right) if is_supported(each, found.tails)]
         supported = [self._supported, *own]
+        rho = inverse_depths(found.curve, tracks.ends, tracks.starts, tracks.focal)
+        disparities = self.rig.camera.fx * self.rig.baseline * rho
+        least = LEAST_DEPTHS * np.sqrt(2.0) * noise_px(found.tails)
         for number in range(self.first, self.first + count):
+            inliers = right[number - self.first]
+            seen = disparities[tracks.members[number - self.first][: len(inliers)][inliers]]
+            depths = bool(len(seen) == 0 or np.median(seen) >= least)
             yield StreamedWindow(
                 number=number,
                 motion=ContinuousMotion.of(part(found.curve, number + start, number + end, float(number))),
                 body_from_world=evaluate(found.curve, float(number))[0],
-                covariance=motion_covariance(found.curve, inverse, float(number)),
-                inliers=right[number - self.first],
+                covariance=motion_covariance(found.curve, inverse, float(number)) if depths else None,
+                depths=depths,
+                inliers=inliers,
                 apart=min(abs(number - each) for each in supported),
                 noise_px=noise_px(found.tails),
                 gyro=self.gyro_found(found),

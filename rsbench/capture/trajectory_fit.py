@@ -63,7 +63,7 @@ from rsbench.components.motion_models import LinearMotion
 from rsbench.core import so3
 from rsbench.core.correspondences import BoolArray, Correspondences
 from rsbench.core.motion import Motion
-from rsbench.core.rig import StereoRig
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
@@ -461,9 +461,16 @@ def window_motions(
             paced = shutter.with_ratio(min(shutter.readout_ratio / length, 1.0))
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             found = estimate_motion(window, rig, paced, solver, RobustOptions(), rng).estimate
-        scale = unit * length if alone else unit
+        # If the disparities are negative, the opposite motion would explain them, with points beyond infinity.
+        scale = unit * length if alone else -unit if _converges_too_little(window, rig) else unit
         out.append(LinearMotion(found.w, scale * found.d) if found.success else None)
     return out
+
+
+def _converges_too_little(window: Correspondences, rig: StereoRig) -> bool:
+    """Whether most disparities are negative: points far away, and cameras that converge less than calibrated."""
+    left, right = (rig.eye(side).ideal_pixels(window.tracks[:, 2 * k : 2 * k + 2]) for k, side in enumerate(SIDES))
+    return int(np.count_nonzero(left[:, 0] < right[:, 0])) > len(left) // 2
 
 
 def first_curve(

@@ -208,17 +208,35 @@ def _explain(curve: Curve, track: FloatArray, focal: FloatArray, s: Scratch) -> 
     count = len(track)
     for n in range(count):
         fill_view(curve, track[n, 2], s.views, n)
-    point = _first_point(track, s)
+    point, metric = _first_point(track, s), _sees_disparity(track)
     for step in range(_POINT_STEPS + 1):
         if step > 0:
             point = plus(point, -1.0, _solve(s.L, (s.left[0], s.left[1], s.left[2])))
+        if metric and point[2] < 0.0:
+            point = (point[0], point[1], 0.0)
         if not _linearise(track, focal, point, s, step == 0):
             return BEHIND
+        if metric and point[2] == 0.0 and s.left[2] > 0.0:
+            _fix_at_infinity(s, count)
     s.point[0], s.point[1], s.point[2] = point
     total = _ridge() * point[2] * point[2]
     for n in range(count):
         total += s.e[n, 0] * s.e[n, 0] + s.e[n, 1] * s.e[n, 1]
     return total
+
+
+@compiled(error_model="numpy")
+def _sees_disparity(track: FloatArray) -> bool:
+    """Whether both cameras observe the point. The scale, and with it the sign of rho, is then not free."""
+    return bool(np.any(track[:, 9] != track[0, 9]))
+
+
+@compiled(error_model="numpy")
+def _fix_at_infinity(s: Scratch, count: int) -> None:
+    """Take rho out of the equations of a point that fits best beyond infinity: its rho stays 0."""
+    s.D[:count, :, 2] = 0.0
+    s.left[2], s.N[2, 0], s.N[2, 1], s.N[2, 2] = 0.0, 0.0, 0.0, 1.0
+    _factor(s.N, s.L)
 
 
 @compiled(error_model="numpy")

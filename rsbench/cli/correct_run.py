@@ -130,10 +130,11 @@ def _say_alone(alone: Mapping[Any, Mapping[str, Any]]) -> None:
         return
     least = min(each["explained"] for each in alone.values())
     names = [each for each in alone if isinstance(each, str)]
+    frames = "frame" if len(alone) == 1 else "frames"
     echo(
-        f"rsbench: corrected by each camera alone: frame {', '.join(names) or ranges(list(alone))}: the motion of "
-        f"the rig explains only {100.0 * least:.0f} % of what moves in the images; unless objects fill them, "
-        "check the calibration and readout_ratio",
+        f"rsbench: corrected by each camera alone: {frames} {', '.join(names) or ranges(list(alone))}: "
+        f"the motion of the rig explains only {100.0 * least:.0f} % of what moves in the images; "
+        "unless objects fill them, check the calibration and readout_ratio",
         err=True,
     )
 

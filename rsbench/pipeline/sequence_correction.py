@@ -39,6 +39,7 @@ from rsbench.pipeline.sequence_capture import (
 )
 from rsbench.solvers.engine.base import MotionEstimate
 from rsbench.solvers.engine.robust_motion import MatchCount, RobustEstimate
+from rsbench.solvers.refined import NO_DEPTHS
 from rsbench.vision.images import ahead, map_ahead
 from rsbench.vision.stereo_matcher import needs_motion
 
@@ -101,7 +102,7 @@ def _found(streamed: StreamedWindow, solver: str) -> FoundMotion:
         w=motion.w,
         d=motion.d,
         success=True,
-        reason="" if streamed.supported else BRIDGED,
+        reason=BRIDGED if not streamed.supported else "" if streamed.depths else NO_DEPTHS,
         metric=True,
         noise_px=streamed.noise_px,
         covariance=streamed.covariance,

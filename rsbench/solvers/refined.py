@@ -137,9 +137,10 @@ _NOISIER = 10.0
 _NEARLY_PLANAR = 0.15
 """Largest share of the flow that a homography may leave unexplained for its motions to be tried; off a plane it is
 0.2 and more."""
-_LEAST_DEPTHS = 0.7
+LEAST_DEPTHS = 0.7
 """Median disparity over its deviation below which equations that are linear in the point do not describe its
 error: in such problems half of the stated 95 % ellipsoids contained the truth."""
+NO_DEPTHS = "no deviation can be stated: disparities are smaller than their noise"
 _LEAST_NOISE_PX = 0.01
 """Least noise in the test whether data determine a rotation, px: exact data have no residuals."""
 
@@ -380,17 +381,22 @@ class RefinedSolver(Solver):
         known = scale_sigma <= self.max_scale_sigma and not at_limit and not packed.one_camera
         metric = linked or known
         # Without parallax, noise looks like translation, but half of the points come out behind the cameras.
-        in_front = linked or packed.in_front(best.theta) >= _LEAST_IN_FRONT * len(packed.pairs)
+        # Tracks at negative disparities would also be explained by the opposite motion, beyond infinity.
+        disparity = _disparity(packed) if linked else 0.0
+        in_front = (
+            disparity >= 0.0 if linked else packed.in_front(best.theta) >= _LEAST_IN_FRONT * len(packed.pairs)
+        )
         direction_known = in_front and direction_sigma <= self.max_direction_sigma and not rival
         reasons = [] if metric else ["the length of d is not determined by these matches"]
-        if linked and variance > 0.0 and _depths(packed, variance) < _LEAST_DEPTHS:
+        if linked and disparity < LEAST_DEPTHS * np.sqrt(2.0 * variance):
             covariance = None
-            reasons.append("no deviation can be stated: disparities are smaller than their noise")
+            reasons.append(NO_DEPTHS)
         elif stated is not None and stated.count < FEWEST_PER_PARAMETER * packed.parameters:
             covariance = None
             reasons.append(f"no deviation can be stated: {stated.count:.0f} effective matches are too few")
         if not direction_known:
             why = "another motion explains these matches as well (a plane)" if rival else "too little translation"
+            why = why if in_front or not linked else "most disparities are negative: calibrate the rig again"
             reasons.append(f"the direction of d is not determined: {why}")
         return MotionEstimate(
             w=w,
@@ -404,11 +410,10 @@ class RefinedSolver(Solver):
         )
 
 
-def _depths(packed: Packed, variance: float) -> float:
-    """Median disparity of the tracks over its standard deviation, for a coordinate's variance, px^2."""
+def _disparity(packed: Packed) -> float:
+    """Median disparity of the tracks, px."""
     ends = packed.tracks
-    disparities = ends[:, 2] if ends.ndim == 2 else packed.focal[0] * (ends[:, 0, 0] - ends[:, 1, 0])
-    return float(np.median(disparities) / np.sqrt(2.0 * variance))
+    return float(np.median(ends[:, 2] if ends.ndim == 2 else packed.focal[0] * (ends[:, 0, 0] - ends[:, 1, 0])))
 
 
 def _finite(packed: Packed, thetas: Iterable[FloatArray]) -> list[MotionEstimate]:

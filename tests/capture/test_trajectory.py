@@ -245,3 +245,23 @@ def test_a_stream_outlives_frames_that_match_nothing() -> None:
         R = law(np.array([each.number, each.number + 1.0]))[0]
         w = Rotation.from_matrix(R[1] @ R[0].T).as_rotvec()
         assert np.rad2deg(np.linalg.norm(each.motion.w - w)) < 0.02
+
+
+@pytest.mark.parametrize(("depths", "speed"), [((2.0, 12.0), 0.15), ((200.0, 1200.0), 15.0)])
+def test_points_are_not_beyond_infinity(depths: tuple[float, float], speed: float) -> None:
+    """Cameras that converge by one pixel too little: disparities of far points become negative.
+
+    With these the opposite motion and points beyond infinity explain all matches. The length of a translation is
+    then not determined, but its direction is.
+    """
+
+    def law(tau: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return np.tile(np.eye(3), (len(tau), 1, 1)), tau[:, None] * np.array([0.0, 0.0, speed])
+
+    windows, _ = matches(law, 6, np.random.default_rng(3), noise=0.1, depths=depths)
+    off = np.zeros(8)
+    off[[2, 6]] = 1.0
+    converging = [Correspondences(tracks=each.tracks + off) for each in windows]
+    for each in stream_trajectory(converging, RIG, SHUTTER):
+        assert each.motion.d[2] < 0.0
+        assert each.depths == (each.covariance is not None) == (depths[0] < 10.0)

@@ -190,7 +190,7 @@ def test_frames_that_the_motion_does_not_explain_are_named(
     tmp_path: Path, frames: list[Path], rig: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(chain, "_CREDIBLE", 2.0)  # more than any motion explains
-    out, words = tmp_path / "out", "rsbench: corrected by each camera alone: frame "
+    out, words = tmp_path / "out", "rsbench: corrected by each camera alone: frames "
     result = correct(*frames, "--rig", rig, "--out", out)
     assert result.returncode == 0, result.stderr
     assert result.stderr.splitlines()[-1].startswith(
