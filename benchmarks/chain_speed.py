@@ -50,6 +50,8 @@ ROOT = Path(__file__).parents[1]
 SECONDS, CORES = 1.5, 2
 """Of the anchor on the machine that limits in frames/s are for, and its cores."""
 BASELINE_M = 0.2
+KEPT = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+"""Environment of commands: Python keeps what it compiled, as it does by default."""
 DENSE = CorrectionOptions(features=load_features("dense"), motion_model="auto")
 STEPS = (
     ("match", "rsbench.pipeline.sequence_correction", "match_frames"),
@@ -204,7 +206,7 @@ def command(sequence: Sequence, name: str, folder: Path) -> Callable[[], object]
     frames = [str(sequence.folder / "rs" / f"{side}_{frame}.png") for frame in FRAMES for side in SIDES]
     words = [sys.executable, "-m", "rsbench", "--quiet", name, *frames, "--rig", str(rig)]
     words += ["--out", str(folder / "out")] if name == "correct" else []
-    return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=name == "correct")
+    return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=name == "correct", env=KEPT)
 
 
 def command_of_video(shown: Video, folder: Path) -> Callable[[], object]:
@@ -225,7 +227,7 @@ def command_of_video(shown: Video, folder: Path) -> Callable[[], object]:
         "--out",
         str(folder / "out.mp4"),
     ]
-    return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=True)
+    return lambda: subprocess.run(words, stdout=subprocess.DEVNULL, check=True, env=KEPT)
 
 
 def matched(sequence: Sequence) -> Callable[[], None]:

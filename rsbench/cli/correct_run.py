@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from rsbench.cli.console import echo, progress_bar
 from rsbench.cli.correct_input import CorrectInput, target_row
 from rsbench.components.imports import component_key
 from rsbench.core.errors import RsbenchError
-from rsbench.core.rig import SIDES
+from rsbench.core.rig import SIDES, View
 from rsbench.core.version import __version__
 from rsbench.dataset import corrected_frames as results
 from rsbench.interop.writers.rectified_pairs import write_calibration, write_rectified
@@ -45,7 +46,7 @@ from rsbench.storage.videos import ORIENTATIONS, UPRIGHT, upright, write_frames
 from rsbench.vision.corrector import CorrectorEntry, NotCorrectedError, demand_corrected
 from rsbench.vision.correctors import FusionCorrector
 from rsbench.vision.fusion import Fused, finished
-from rsbench.vision.images import single_opencv
+from rsbench.vision.images import ahead, single_opencv
 
 _MOST_LISTED = 8
 SUBTITLE = "Rolling shutter to global shutter"
@@ -139,7 +140,8 @@ def _say_alone(alone: Mapping[Any, Mapping[str, Any]]) -> None:
     )
 
 
-_PAGE_FRAMES = 6
+_PAGE_FRAMES, _AHEAD = 6, 4
+"""Frames on the page; frames that are read while others are encoded."""
 
 
 def correct_given(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
@@ -176,23 +178,28 @@ def _correct_four(given: CorrectInput, target: str, options: CorrectionOptions, 
             result = correct_four(images, rig, card.inputs, options, advance)
         demand_corrected(result.frames, options.corrector.name)
         known, rig = result.known, result.rig
-        frames = {view: finished(fused) if close else fused for view, fused in result.frames.items()}
-        for (side, frame), fused in frames.items():
-            results.write_frame(folder, f"{side}_{frame}", fused)
+
+        def written(view: View) -> tuple[Fused, dict[str, Any]]:
+            """The frame as written, and its card on the page."""
+            fused, name = finished(result.frames[view]) if close else result.frames[view], "{}_{}".format(*view)
+            results.write_frame(folder, name, fused)
             if given.rectify:
-                write_rectified(folder, f"{side}_{frame}", fused, rig, side)
+                write_rectified(folder, name, fused, rig, view[0])
+            return fused, card_of("{} {}".format(*view), images[view], fused)
+
+        with ThreadPoolExecutor(2) as threads:
+            frames = dict(zip(result.frames, threads.map(written, result.frames), strict=True))
         if given.rectify:
             write_calibration(folder, rig)
         record = results.capture_record(known, options)
         record["motion"] = None if result.found is None else results.motion_record(result.found)
-        record["frames"] = {f"{side}_{frame}": fused.shares() for (side, frame), fused in frames.items()}
+        record["frames"] = {"{}_{}".format(*view): fused.shares() for view, (fused, _) in frames.items()}
         record["alone"] = alone_of(result.frames)
         record["seconds"] = result.seconds
         results.write_record(folder, record)
-        cards = [card_of(f"{s} {f}", images[s, f], fused) for (s, f), fused in frames.items()]
         read = readout_words(known)
         facts = [("readout ratio", read), *motion_facts(record["motion"])]
-        write_page(folder, f"rsbench correct: {out.name}", SUBTITLE, facts, cards)
+        write_page(folder, f"rsbench correct: {out.name}", SUBTITLE, facts, [card for _, card in frames.values()])
     _say_four(out, f"readout ratio {read}", record)
 
 
@@ -377,7 +384,7 @@ def _write_page(
     )
     shown, video = comparison(pairs, source.orientation, changed), folder / results.comparison_of_video(out).name
     if given.video and numbers:
-        write_frames(video, shown, fps=results.DEFAULT_FPS, times=source.times if one else None)
+        write_frames(video, ahead(shown, _AHEAD), fps=results.DEFAULT_FPS, times=source.times if one else None)
     else:
         deque(shown, maxlen=0)
     results.join_poses(folder, "row_poses")
@@ -426,7 +433,7 @@ def _write_video(
         for number, moment in enumerate(zip(*sources, strict=True))
     )
     fps, orientation = results.fps_of(first.path), None if one else UPRIGHT
-    return results.write_video(given.out, folder, images, fps, record, first, others, orientation)
+    return results.write_video(given.out, folder, ahead(images, _AHEAD), fps, record, first, others, orientation)
 
 
 def _say(given: CorrectInput, known: KnownCapture, record: dict[str, Any], lines: list[str]) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -144,15 +145,19 @@ def correct_four(
         known = know_four(images, rig, inputs, options, given.matches)
     known = replace(known, camera_note=note)
     clock("matching")
-    found = solve_frames(known, options) if wanted else None
-    clock("motion")
     rig, shutter, offset = known.rig, known.shutter, known.calibration[OFFSET]
     if known.capture is not None:
         check_cameras(rig, shutter.scanning, options, errors[OFFSET], given.pairs is not None)
+    pairs, stereo = given.pairs, None
+    with ThreadPoolExecutor(1) as beside:
+        if "depth" in needs and pairs is None and options.matcher.built_in and not _waits(rig, shutter, options):
+            stereo = beside.submit(frame_pairs, images, rig, options, offset)
+        found = solve_frames(known, options) if wanted else None
+        clock("motion")
+        pairs = pairs if stereo is None else stereo.result()
     motion = given.motion if found is None else found.motion
-    pairs = (
-        find_depth(images, rig, shutter, motion, options, given.pairs, offset) if "depth" in needs else given.pairs
-    )
+    if "depth" in needs:
+        pairs = find_depth(images, rig, shutter, motion, options, pairs, offset)
     clock("depth")
     given = replace(given, matches=known.matches, motion=motion, pairs=pairs)
     frames, *at_rows = correct_known_rows(
@@ -226,9 +231,9 @@ def find_depth(
     frames: tuple[int, ...] = FRAMES,
 ) -> Pairs:
     """The frames with depth by the matcher unless ``pairs`` has it, completed from the motion in ``frames``."""
-    by_motion = needs_motion(options.matcher)
-    if pairs is None and (by_motion or not rig.rows_together(shutter.scanning, shutter.readout_ratio)):
+    if pairs is None and _waits(rig, shutter, options):
         if motion is None:
+            by_motion = needs_motion(options.matcher)
             needer = f"matcher {options.matcher.name!r}" if by_motion else "a pair of images with two times"
             raise ValueError(f"the motion must be given: {needer} needs it")
         pairs = moving_pairs(images, rig, shutter, motion, options)
@@ -241,6 +246,11 @@ def find_depth(
     if options.depth_from_motion and motion is not None and not all(pair.with_motion for pair in pairs):
         pairs = complete_depth(pairs, rig, shutter, motion, frames)
     return pairs
+
+
+def _waits(rig: StereoRig, shutter: RollingShutter, options: CorrectionOptions) -> bool:
+    """Whether stereo depth needs the motion."""
+    return needs_motion(options.matcher) or not rig.rows_together(shutter.scanning, shutter.readout_ratio)
 
 
 def correct_frames(

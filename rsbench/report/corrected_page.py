@@ -24,7 +24,7 @@ from rsbench.report import pictures
 from rsbench.report.markup import rendered
 from rsbench.report.pictures import Image
 from rsbench.storage.files import read_json, write_bytes
-from rsbench.storage.videos import UPRIGHT, upright
+from rsbench.storage.videos import SIDEWAYS, UPRIGHT, upright
 from rsbench.vision.fusion import Fused, Origin
 
 _WIDE, _HIGH, _LEFT, _TOP = 520.0, 200.0, 64.0, 10.0
@@ -183,7 +183,7 @@ def card_of(
     finite = np.isfinite(fused.depth) & (fused.depth > 0)
     known = float(np.mean(finite))
     inverse = np.where(finite, 1.0 / np.where(finite, fused.depth, 1.0), np.nan)
-    low, high = np.nanpercentile(inverse, [1, 99]) if known else (0.0, 1.0)
+    low, high = np.percentile(inverse[finite], [1, 99]) if known else (0.0, 1.0)
     origin_picture = np.zeros((*fused.origin.shape, 3), dtype=np.uint8)
     for origin, colour in _COLOURS.items():
         origin_picture[fused.origin == origin] = colour
@@ -266,8 +266,8 @@ def ranges(numbers: Sequence[int]) -> str:
     return ", ".join(" to ".join(map(str, run)) for run in runs)
 
 
-_WIDEST = 1920
-"""Largest width of a comparison, px."""
+_WIDEST, _TALLEST = 1920, 1080
+"""Largest width and height of a comparison, px."""
 _COARSE = 4
 """Step between pixels at which changes are measured."""
 
@@ -278,14 +278,17 @@ def comparison(
     """Frames before and after, side by side in display orientation; their mean difference in grey levels is
     appended to ``changed``."""
     for before, after in pairs:
-        both = _eight_bit(np.stack([before, after]) if before.ndim == 3 else np.stack([before, after])[..., None])
-        old, new = both if before.ndim == 3 else np.repeat(both, 3, axis=-1)
-        small = [each[::_COARSE, ::_COARSE].astype(np.float32) for each in (old, new)]
-        changed.append(float(np.mean(np.abs(small[0] - small[1]))))
-        both = np.hstack([upright(each, orientation) for each in (old, new)])
-        scale = min(_WIDEST / both.shape[1], 1.0)
-        size = [2 * max(int(side * scale) // 2, 1) for side in both.shape[1::-1]]
-        yield both if scale == 1.0 else np.asarray(cv2.resize(both, size, interpolation=cv2.INTER_AREA), np.uint8)
+        scaled_by = None if before.dtype == np.uint8 else np.stack([before, after])
+        both = [_eight_bit(each, scaled_by) for each in (before, after)]
+        coarse = [each[::_COARSE, ::_COARSE].astype(np.float32) for each in both]
+        changed.append(float(np.mean(np.abs(coarse[0] - coarse[1]))))
+        stored = before.shape[1::-1]
+        wide, tall = stored[::-1] if orientation in SIDEWAYS else stored
+        scale = min(_WIDEST / (2 * wide), _TALLEST / tall, 1.0)
+        if scale < 1.0:
+            size = [2 * max(int(side * scale) // 2, 1) for side in stored]
+            both = [np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8) for each in both]
+        yield np.hstack([upright(each, orientation) for each in both])
 
 
 def most_changed(changed: Sequence[float], count: int) -> list[int]:
@@ -306,10 +309,11 @@ def _one_motion(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
     return found[0] if found and all(each == found[0] for each in found) else None
 
 
-def _eight_bit(image: NDArray[Any]) -> Image:
-    """Convert an image to RGB uint8; 16 bits, which may be used only in part, are scaled by their maximum."""
+def _eight_bit(image: NDArray[Any], scaled_by: NDArray[Any] | None = None) -> Image:
+    """Convert an image to RGB uint8; 16 bits, which may be used only in part, are scaled by the maximum of the
+    image or of another array."""
     if image.dtype != np.uint8:
-        top = max(float(np.percentile(image, 99.9)), 1.0)
+        top = max(float(np.percentile(image if scaled_by is None else scaled_by, 99.9)), 1.0)
         image = np.clip(image * (255.0 / top), 0.0, 255.0).astype(np.uint8)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 else image, dtype=np.uint8)
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rsbench.benchmark.statistics import format_interval
+
+if TYPE_CHECKING:  # it takes half a second to load
+    import pandas as pd
 
 
 def rendered(template: str, *, trim: bool = False, **values: Any) -> str:
@@ -40,5 +42,7 @@ def frame_text(table: pd.DataFrame) -> str:
 
 def words_of(row: Mapping[Any, Any], name: str) -> str:
     """The number of the columns of ``with_ends`` with its interval; a dash where there is none."""
+    import pandas as pd
+
     value, low, high = (row[name + end] for end in ("", "_low", "_high"))
     return "-" if pd.isna(value) else format_interval(value, low, high)

@@ -35,13 +35,17 @@ def masked(image: Image, mask: NDArray[np.bool_]) -> Image:
     return np.where(mask[..., None], image, np.array(INVALID, dtype=np.uint8))
 
 
-def colour_map(values: ArrayLike, low: float, high: float, name: str = "viridis") -> Image:
-    """Values (H, W) in a matplotlib colour map between ``low`` and ``high``; what is not finite is dark grey."""
-    from matplotlib import colormaps
+_MAPS = {"viridis": cv2.COLORMAP_VIRIDIS, "magma": cv2.COLORMAP_MAGMA, "inferno": cv2.COLORMAP_INFERNO}
 
-    v = np.asarray(values, dtype=np.float64)
-    coloured = colormaps[name](np.clip((v - low) / max(high - low, 1e-12), 0.0, 1.0))[..., :3]
-    return np.where(np.isfinite(v)[..., None], np.round(255 * coloured), INVALID).astype(np.uint8)
+
+def colour_map(values: ArrayLike, low: float, high: float, name: str = "viridis") -> Image:
+    """Values (H, W) in a colour map of matplotlib, between ``low`` and ``high``; others are dark grey."""
+    v = (np.asarray(values, dtype=np.float64) - low) / max(high - low, 1e-12)
+    known = np.isfinite(v)
+    levels = np.where(known, np.clip(256.0 * v, 0.0, 255.0), 0.0).astype(np.uint8)
+    coloured = cv2.cvtColor(cv2.applyColorMap(levels, _MAPS[name]), cv2.COLOR_BGR2RGB)
+    coloured[~known] = INVALID
+    return coloured
 
 
 def draw_matches(image: Image, matches: FloatArray, inliers: NDArray[np.bool_]) -> Image:

@@ -64,6 +64,10 @@ _BEFORE = 1.0
 """Seconds of sound that may be written before the frames of that time."""
 
 
+SIDEWAYS = tuple(number for number, matrix in _MATRICES.items() if matrix[0] == 0)
+"""Orientations in which a stored row is shown as a column."""
+
+
 def upright(image: Image, orientation: int) -> Image:
     """A stored image (H, W[, C]) as it is shown."""
     a, b, c, d = _MATRICES[orientation]
