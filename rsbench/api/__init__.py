@@ -50,13 +50,14 @@ def project(
     side: Side = "left",
     frame: int = 0,
 ) -> RSProjection:
-    """Pixels at which a moving rolling-shutter camera sees world points (..., 3), metres.
+    """Project world points (..., 3), metres, into a frame of a moving rolling-shutter camera.
 
-    Exact: the row that sees a point is solved for, to 1e-9 px. ``frame`` counts from 0.
+    The equation of the row that sees a point is solved to 1e-9 px. ``frame`` counts from 0.
 
     Returns:
-        ``pixels`` (..., 2), ``depth`` (...) z in the camera of that row, ``tau`` (...) its time, ``status`` (...):
-        0 seen, 1 never seen, 2 seen twice (the first is given), 3 not converged. NaN where nothing was seen.
+        ``pixels`` (..., 2); ``depth`` (...), z in the camera at that row's time; ``tau`` (...), that time;
+        ``status`` (...): 0 seen, 1 never seen, 2 seen twice (the first time is returned), 3 not converged. NaN
+        where no row sees the point.
     """
     check_view(side, frame)
     check_moving_rig(rig, shutter, motion)
@@ -76,23 +77,23 @@ def simulate(
     shape: Literal["box", "plane"] = "box",
     seed: int = 0,
 ) -> Simulation:
-    """Matches of random points that the moving rig sees, with noise and outliers.
+    """Simulate matches of random points seen by a moving rig, with noise and outliers.
 
     Args:
-        rig, shutter, motion: what sees, how it reads, how it moves.
-        pairs: matches over time of each camera, with points of their own.
-        tracks: points seen in all four images.
+        rig, shutter, motion: the cameras, their row times, and the motion of the rig.
+        pairs: number of matches between frame 0 and frame 1 of each camera; each camera has points of its own.
+        tracks: number of points that are matched through all four images.
         noise_px: standard deviation of every pixel coordinate.
         outlier_ratio: share of matches whose pixels in frame 1 are wrong, by up to 80 px.
-        depth: range of the points' depths in frame 0, metres.
-        shape: points at random depths, or on one slanted plane.
-        seed: the same seed gives the same points and noise whatever the other arguments are.
+        depth: least and largest depth of the points in frame 0, metres.
+        shape: ``box``: random depths; ``plane``: all points on one slanted plane.
+        seed: points and noise depend on the seed alone, not on the other arguments.
 
     Returns:
-        ``correspondences``, and ``outliers`` with a mask for each of ``left``, ``right`` and ``tracks``.
+        ``correspondences``, and ``outliers``, a mask for each of ``left``, ``right`` and ``tracks``.
 
     Raises:
-        ValueError: an argument out of its range, or a motion that leaves too few points in view.
+        ValueError: an argument is out of its range, or too few points stay in view.
     """
     from rsbench.benchmark.simulated.simulation import SimulationOptions
     from rsbench.benchmark.simulated.simulation import simulate as simulate_points
@@ -115,25 +116,25 @@ def estimate_motion(
     threshold_px: float | None = None,
     seed: int = 0,
 ) -> RobustEstimate:
-    """Motion of the rig over one frame period from matches that may hold outliers.
+    """Estimate the motion of a rig over one frame period from matches with outliers.
 
     Args:
         correspondences: matches, px.
-        rig, shutter: the cameras and how they read their rows.
+        rig, shutter: the cameras and their row times.
         solver: a name of ``list_solvers``, the path of a card or of a Python file, a ``Solver``, or a function
             that ``rsbench.solver`` decorates.
-        motion_model: ``auto``, the one that the matches prefer, or a name; None: the one that the solver assumes.
-        threshold_px: largest error of an inlier; None follows the noise that the inliers show.
-        seed: of the samples that the robust loop draws.
+        motion_model: a name, or ``auto`` for the most probable model; None: the model that the solver assumes.
+        threshold_px: largest error of an inlier; None: it is adapted to the noise of the inliers.
+        seed: seed of RANSAC's samples.
 
     Returns:
-        ``estimate``, a ``MotionEstimate`` whose ``success`` is False, with a ``reason``, when there is none; and
-        ``inliers``, a mask for each of ``left``, ``right`` and ``tracks``; ``inlier_count`` of ``match_count``
-        count each match once.
+        ``estimate``, a ``MotionEstimate``: if no motion was found, its ``success`` is False and its ``reason``
+        says why; ``inliers``, a mask for each of ``left``, ``right`` and ``tracks``; ``inlier_count`` and
+        ``match_count``, which count each match once.
 
     Raises:
-        RsbenchError: no such solver or motion model, or the solver can take no other than its own.
-        ValueError: an argument of another type or out of its range.
+        RsbenchError: there is no such solver or motion model, or the solver supports only its own model.
+        ValueError: an argument has a wrong type or is out of its range.
     """
     from rsbench.solvers.engine.base import entry_of
     from rsbench.solvers.engine.robust_motion import RobustOptions
@@ -160,21 +161,21 @@ def pose_errors(
     *,
     reference_point: Literal["body", "left"] | None = None,
 ) -> dict[str, float]:
-    """Errors of an estimate against the true motion, as docs/explanation/conventions.md defines them.
+    """Compute the errors of an estimated motion, as defined in docs/explanation/conventions.md.
 
     Args:
-        found: what ``estimate_motion`` returned, or a solver itself.
-        motion: the truth.
-        rig: whose left camera ``reference_point`` may mean.
-        reference_point: the point whose translation ``found`` gives. None is what ``estimate_motion`` says, and
-            the body for an answer of a solver itself, whose ``spec`` knows better.
+        found: result of ``estimate_motion`` or of a solver.
+        motion: true motion.
+        rig: the cameras.
+        reference_point: the point whose translation ``found`` contains: ``body`` or ``left`` (the left camera).
+            None: the one named by the result of ``estimate_motion``; for a result of a solver, the body.
 
     Returns:
-        ``e_R_deg``, ``e_T_deg`` (degrees) and ``e_s``. A failure scores 180, 180 and infinity. NaN where there is
-        nothing to compare: e_s of an estimate without metres, e_T and e_s where the true translation is zero.
+        ``e_R_deg``, ``e_T_deg`` (degrees) and ``e_s``. A failure scores 180, 180 and infinity. NaN: there is
+        nothing to compare, as e_s of an estimate without metric scale, or e_T and e_s without a true translation.
 
     Raises:
-        ValueError: no such reference point.
+        ValueError: there is no such reference point.
     """
     from rsbench.benchmark import scoring
     from rsbench.solvers.engine.base import MotionEstimate
@@ -200,15 +201,15 @@ def pose_errors(
 
 
 def match(images: Series[Image], *, features: str | Path = "dense") -> Correspondences:
-    """Matches of the four images of a rig over two frames: over time, left to right, and through all four.
+    """Match the four images of a rig over two frames: over time, left to right, and through all four images.
 
     Args:
         images: four images.
         features: name or card of the feature matcher.
 
     Raises:
-        ValueError: not four images that are alike, uint8 or uint16.
-        RsbenchError: no such feature matcher.
+        ValueError: there are not four images of equal size and type (uint8 or uint16).
+        RsbenchError: there is no such feature matcher.
     """
     from rsbench.pipeline.frame_capture import find_matches
     from rsbench.pipeline.frame_depth import CorrectionOptions
@@ -223,13 +224,13 @@ def match(images: Series[Image], *, features: str | Path = "dense") -> Correspon
 def stereo_depth(
     left: Image, right: Image, rig: StereoRig, *, side: Side = "left", matcher: str | Path = "sgm"
 ) -> NDArray[np.float32]:
-    """Depth (H, W), metres, on the pixels of one image of a rectified pair; 0 where it is unknown.
+    """Compute the depth (H, W), metres, of one image of a rectified pair; 0: unknown.
 
-    Holds for rolling-shutter pairs too: both cameras read the same row at the same time.
+    The pair may be a rolling-shutter one, since both cameras read the same row at the same time.
 
     Raises:
-        ValueError: the images do not fit each other or the rig.
-        RsbenchError: no such matcher.
+        ValueError: the images differ in size or type, or do not have the size of the rig's cameras.
+        RsbenchError: there is no such matcher.
     """
     from rsbench.vision.stereo_matcher import find_disparities, load_matcher
 
@@ -243,10 +244,10 @@ def stereo_depth(
 
 
 def read_dataset(folder: AnyPath) -> list[Sequence]:
-    """Sequences of a dataset on disk; their images, depth and row poses are read when they are used.
+    """Open the sequences of a dataset on disk; images, depth and row poses are read when they are used.
 
     Raises:
-        RsbenchError: not a finished dataset, or a sequence that cannot be read.
+        RsbenchError: the folder has no complete dataset, or a sequence cannot be read.
     """
     from rsbench.dataset import sequence
 
@@ -259,23 +260,23 @@ def read_rig(
     *,
     fps: float | None = None,
 ) -> KnownRig:
-    """The cameras of a rig from a calibration of another tool as it is, from rig.toml, or from a card by its name.
+    """Read the cameras of a rig from a calibration of another tool, from rig.toml, or from a card by its name.
 
-    ``correct(images, found.rig, found.readout_ratio, scanning=found.scanning)`` then takes all that the file says.
+    ``correct(images, found.rig, found.readout_ratio, scanning=found.scanning)`` uses all values of the file.
 
     Args:
-        path: of Kalibr, OpenVINS, OpenCV, ROS, Basalt, ZED, DepthAI, RealSense, COLMAP or EuRoC: a file, or a
-            folder of files that belong together. Its content says of which tool it is.
-        size: (width, height) of the images, or those of the left and of the right ones, where the file does not
-            say them or has several.
-        fps: frames a second, for readouts that the file gives in seconds.
+        path: a file of Kalibr, OpenVINS, OpenCV, ROS, Basalt, ZED, DepthAI, RealSense, COLMAP or EuRoC, or a
+            folder of such files. The tool is recognised by the content.
+        size: (width, height) of the images, or two of these, left and right; needed if the file has no size or
+            several.
+        fps: frames per second; needed if the file gives readout times in seconds.
 
     Returns:
-        ``rig``; ``readout_ratio`` and ``scanning``, None where the frames have to tell; ``notes``, sentences about
-        what was assumed.
+        ``rig``; ``readout_ratio`` and ``scanning``, None if the file does not have them; ``notes``, sentences
+        about what was assumed.
 
     Raises:
-        RsbenchError: a file that cannot be read or represented, or another size than its own.
+        RsbenchError: the file cannot be read or represented, or is for images of another size.
     """
     from rsbench.interop.readers.rig_files import known_rig
 
@@ -296,16 +297,16 @@ def read_rig(
 
 
 def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, workers: int = 1) -> list[Sequence]:
-    """Render a dataset into a folder and open it; what was rendered before from the same card is kept.
+    """Render a dataset into a folder and open it. Sequences that the folder already has are not rendered again.
 
     Args:
         card: name of a dataset card (``rsbench list datasets``) or path to one.
-        out: folder.
-        sequences: names of those to render; None renders all.
-        workers: processes; each renders whole sequences.
+        out: folder of the dataset.
+        sequences: names of the sequences to render; None: all.
+        workers: number of processes; each renders whole sequences.
 
     Raises:
-        RsbenchError: no such card or sequence, or a folder with another dataset.
+        RsbenchError: there is no such card or sequence, or the folder has another dataset.
     """
     from rsbench.dataset.card import load_dataset_card
     from rsbench.dataset.generation import generate_dataset
@@ -322,16 +323,20 @@ def generate(card: str, out: AnyPath, *, sequences: Series[str] | None = None, w
 def verify(
     folder: AnyPath, *, stride: int = 1, rerender: Rerender = "auto", scenes: Series[AnyPath] = ()
 ) -> list[SequenceReport]:
-    """Check a dataset: files and lists, poses, all depth maps and images against each other, rows rendered again.
-
-    Returns one report per sequence, in order when its ``faults`` are empty; before them one of dataset.json if it
-    has any. Raises RsbenchError for what is no dataset.
+    """Check a dataset: its files and poses, depth maps and images against each other, and rows rendered again.
 
     Args:
-        folder: of the dataset.
-        stride: compare every n-th pixel in both directions.
-        rerender: rows to render again where the scene can be built here: "no", "auto" (seconds) or "all".
-        scenes: cards of scenes that are not rsbench's own, and mesh files of objects that move.
+        folder: folder of the dataset.
+        stride: every n-th pixel in both directions is compared.
+        rerender: rows to render again if the scene can be built here: "no", "auto" (takes seconds) or "all".
+        scenes: cards of scenes that are not part of rsbench, and mesh files of moving objects.
+
+    Returns:
+        One report per sequence; a sequence without ``faults`` passed. If dataset.json itself has faults, the first
+        report lists them.
+
+    Raises:
+        RsbenchError: the folder has no dataset.
     """
     from rsbench.verification import verify_dataset
 
@@ -355,22 +360,26 @@ def evaluate(
     seeds: int = 1,
     seed: int = 0,
 ) -> dict[str, pd.DataFrame]:
-    """Run solvers, depth and correction on a dataset and score them against its truth.
+    """Run solvers, stereo matching and correction on a dataset and score the results against its truth.
 
     Args:
-        folder, out: of the dataset; of predictions and scores: current ones that it holds are kept, and scored.
+        folder: folder of the dataset.
+        out: folder of predictions and scores; predictions in it that are up to date are kept.
         solvers: names of ``list_solvers`` or paths of cards.
-        correct_with: solver whose motion the correction uses.
-        matcher, features, corrector, metrics: names or cards; the metrics are further ones.
-        only: names of solvers and sequences: predict nothing else. All is scored.
-        force: predict again what is there already; rehash: read data again that seem unchanged.
-        seeds: runs of each solver, with other RANSAC samples: one row each in ``pose``; seed: of every choice.
+        correct_with: solver whose motion is used for the correction.
+        matcher, features, corrector: names or cards.
+        metrics: names or cards of further metrics.
+        only: names of solvers and sequences; others are not predicted. All predictions are scored.
+        force: repeat predictions that are up to date.
+        rehash: read all data again, also files that seem unchanged.
+        seeds: number of runs of each solver, with different RANSAC samples; each is a row of ``pose``.
+        seed: first of these seeds.
 
     Returns:
         The tables ``pose``, ``depth``, ``correction``, ``failures`` and ``seconds``: ``rsbench docs score-files``.
 
     Raises:
-        RsbenchError: not a dataset, or no such component.
+        RsbenchError: the folder has no dataset, or there is no such component.
     """
     from rsbench.benchmark.images.evaluation import open_evaluation, read_scores
     from rsbench.benchmark.images.plan import EvaluationOptions
@@ -405,29 +414,29 @@ def estimate_trajectory(
     seed: int = 0,
     gyro: ArrayLike | None = None,
 ) -> Trajectory:
-    """The rig's trajectory through a sequence, one continuous-time spline, from matches with or without outliers.
+    """Estimate the trajectory of a rig in a sequence, as a continuous-time spline.
 
     Args:
-        sequence: the matches of frames 0 and 1, 1 and 2, ..., of which ``tracks`` must be there; or the frames: of
-            each time the images of the left and the right camera, rectified.
+        sequence: matches of frames 0 and 1, 1 and 2, and so on, with ``tracks`` and possibly outliers; or frames:
+            for each time the left and the right image.
         rig: both cameras.
-        shutter: how they read; None has it found, of four frames and more.
-        features: name or card of the feature matcher, where frames are given.
-        seed: of the search for motions of single windows.
-        gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``, tau in frame periods of the sequence. Bias,
-            noise, a clock that is off by up to half a frame period, and axes and scales that are off by some
-            degrees and hundredths are found; the shutter is found without it.
+        shutter: row times; None: they are estimated, which needs four frames.
+        features: name or card of the feature matcher, if frames are given.
+        seed: seed of the search for motions of single windows.
+        gyro: (n, 4) samples of a gyroscope, as in ``Correspondences``, with tau in frame periods of the sequence.
+            Its bias, noise, clock offset (up to half a frame period), misalignment (some degrees) and scale errors
+            (some per cent) are estimated. The shutter is estimated without it.
 
     Returns:
-        ``motion``: ``body_from_world(tau)`` at any times in frame periods, seen from the body at time 0;
-        ``covariance(tau)`` and ``covariance_between(start, tau)`` (n, 6, 6) of turns about the body's axes,
-        radians, and of its position, metres; ``shutter``; ``noise_px``; for each window ``inliers`` and
-        ``supported``, False where its own matches do not carry it and the spline bridges it; ``gyro``: ``bias``,
-        ``shift``, ``matrix``, ``noise`` and whether it is ``used``, which one is not that contradicts the matches.
+        ``motion``, with ``body_from_world(tau)`` at any time, frame periods; the world is the body at time 0.
+        ``covariance(tau)`` and ``covariance_between(start, tau)`` (n, 6, 6) of small rotations about the body's
+        axes, radians, and of its position, metres. ``shutter``; ``noise_px``. For each window ``inliers``, and
+        ``supported``: False if too few of its matches agree and the spline is interpolated. ``gyro``, with
+        ``bias``, ``shift``, ``matrix``, ``noise`` and ``used``, which is False if it contradicts the matches.
 
     Raises:
-        ValueError: an argument of another type or out of its range; no tracks.
-        RsbenchError: no such feature matcher; a shutter that the matches do not tell; matches of no motion.
+        ValueError: an argument has a wrong type or is out of its range, or there are no tracks.
+        RsbenchError: there is no such feature matcher, or the matches do not determine the shutter or a motion.
     """
     from rsbench.pipeline.arrays import matches_of, trajectory_of
 
@@ -451,10 +460,10 @@ def _estimate_under(
     options: RobustOptions,
     seed: int,
 ) -> RobustEstimate:
-    """An estimate under the motion model that is requested or that the matches prefer (``auto``).
+    """Estimate the motion under the requested motion model, or under the most probable one (``auto``).
 
     Raises:
-        RsbenchError: no such model, or the solver can take no other than its own.
+        RsbenchError: there is no such model, or the solver supports only its own model.
         NoMotionError: the solver found only the direction of the translation.
     """
     from rsbench.pipeline.frame_motion import Matched, check_model, motion_of, under_model
@@ -531,40 +540,41 @@ def correct(
     focal_sigma: float = 0.0,
     k1_sigma: float = 0.0,
 ) -> CorrectedFrames | list[Fused]:
-    """The global-shutter frames that the cameras would have taken, from their rolling-shutter frames.
+    """Correct rolling-shutter frames: return the frames that global-shutter cameras would have taken.
 
-    Of a stereo rig, give four images and ``rig``; of one camera, two or more in order, and ``camera``.
+    For a stereo rig, give four images and ``rig``; for one camera, two or more images in order and ``camera``.
 
     Args:
-        images: as the sensor read them.
-        rig: both cameras, with their lens where they have one.
-        readout_ratio: readout time over frame period; None has it found, with the side that lines are read from.
-        scanning: how the rig's cameras read their lines: from which side, the right one's delay and readout ratio.
-            None: from the top, both at once, or found with the readout ratio.
-        camera: one camera: its intrinsics, or its horizontal field of view in degrees, or "unknown". Of the other
-            arguments one camera takes readout_ratio, target_row, inpaint, seed, gyro and gyro_clock_error.
-        solver: finds the motion, in metres; as in ``estimate_motion``.
-        motion_model: ``auto``, which the matches prefer, or a name; None is auto where the solver takes it.
-        matcher, features, corrector: names or cards of what finds depth and matches, and corrects.
-        target_row: the time of this row of a frame is that of its corrected image.
-        inpaint: invent all pixels that no frame shows, or none; None closes specks and slits alone.
-        seed: of the robust loop's samples.
-        gyro: (n, 4) samples of a gyroscope, as of ``Correspondences``: of a rig for correctors that need them; of
-            one camera they are its rotation, tau 0 the first row of the first frame.
-        gyro_clock_error: frame periods by which the clock of ``gyro`` may be off, for one camera: its offset is
-            then estimated from six pairs of frames and more. ``rsbench correct`` allows half a second.
-        focal_sigma, k1_sigma: standard deviations of the rig's focal length, px, and of its lens's k1; both values
-            are estimated first, and the result's ``rig`` has them. 0: exact.
+        images: unrectified, with the rows as the sensor read them.
+        rig: both cameras, with their lenses.
+        readout_ratio: readout time divided by the frame period; None: it is estimated, with the scan direction.
+        scanning: scan direction of the rig's cameras, and delay and readout ratio of the right one. None: from the
+            top and both at once, or estimated with the readout ratio.
+        camera: intrinsics of one camera, its horizontal field of view in degrees, or "unknown". For one camera,
+            the other arguments are readout_ratio, target_row, inpaint, seed, gyro and gyro_clock_error.
+        solver: estimates the motion in metres; as in ``estimate_motion``.
+        motion_model: a name, or ``auto`` for the most probable model; None: ``auto`` if the solver supports it.
+        matcher, features, corrector: names or cards of the stereo matcher, feature matcher and corrector.
+        target_row: a corrected frame shows the scene at the time of this row.
+        inpaint: True: fill all pixels that no frame shows; False: none; None: only specks and narrow slits.
+        seed: seed of RANSAC's samples.
+        gyro: (n, 4) samples of a gyroscope, as in ``Correspondences``. With a rig they are used by correctors that
+            need them; with one camera they give its rotation, and tau 0 is the first row of the first frame.
+        gyro_clock_error: largest error of the clock of ``gyro``, frame periods; above 0, the offset is estimated,
+            which needs seven frames. For one camera. ``rsbench correct`` allows half a second.
+        focal_sigma, k1_sigma: standard deviations of the given focal length, px, and of the lens parameter k1 of a
+            rig. Above 0, both are estimated, and the result's ``rig`` has the estimates.
 
     Returns:
-        Of a rig ``frames["left", 0]`` and so on, with ``image``, ``depth`` and ``origin``; ``motion``,
-        ``shutter`` and ``rig``. Of one camera a list of such frames, whose unit of length is the camera's
-        translation over one frame period; a frame that cannot be corrected, and is given back as it was, has a
-        ``reason``.
+        For a rig: ``frames["left", 0]`` and so on, each with ``image``, ``depth`` and ``origin``; ``motion``,
+        ``shutter`` and ``rig``. For one camera: a list of such frames; the unit of length is the translation of
+        the camera over one frame period. A frame that cannot be corrected is returned as it was, and its
+        ``reason`` says why.
 
     Raises:
-        ValueError: images of another type or size than the rig's cameras, a ratio or row out of its range.
-        RsbenchError: frames that are not what they should be; no such component; no motion; no correction.
+        ValueError: images differ in type, or in size from the rig's cameras; a ratio or row is out of its range.
+        RsbenchError: the frames contradict the arguments, there is no such component, or the frames do not
+            determine a motion.
     """
     from rsbench.capture.calibration import CardSigma
     from rsbench.capture.hypotheses import KnownInputs
@@ -603,7 +613,7 @@ def correct(
 
 
 def _check_own(*components: object) -> None:
-    """ValueError where a component is named that one camera does not have."""
+    """Raise ValueError if a component is given that one camera does not use."""
     names = ("solver", "motion_model", "matcher", "features", "corrector")
     for name, value, default in zip(names, components, _COMPONENTS, strict=True):
         if not isinstance(value, str | Path | None) or value != default:

@@ -236,7 +236,7 @@ def pose_errors(
 
     Returns:
         ``e_R_deg`` and ``e_T_deg`` (degrees) and ``e_s``. A failure scores 180, 180 and infinity. NaN where an
-        error does not exist, for nobody then: e_T where the true translation is zero; and for an estimate that
+        error does not exist for any method: e_T where the true translation is zero; and for an estimate that
         did not fail, e_s where that is so or no metres are claimed.
 
     Raises:

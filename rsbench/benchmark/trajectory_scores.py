@@ -276,7 +276,7 @@ def jitter(estimate: FloatArray, truth: FloatArray) -> float:
     return float(np.mean(np.linalg.norm(off, axis=-1))) if np.all(np.isfinite(off)) else float("inf")
 
 
-# Of a sequence
+# Errors of a sequence
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -280,7 +280,7 @@ def expected_equations(
     curve: Curve, tracks: TimedTracks, tails: Tails, prior: Prior, trust: FloatArray, drift: Drift | None = None
 ) -> Equations:
     """``normal_equations`` with the expected information in place of the observed one."""
-    # Of a t distribution: K. Lange, R. Little, J. Taylor, see ``packed.HeavyTailed``.
+    # Weights of a t distribution: K. Lange, R. Little, J. Taylor, see ``packed.HeavyTailed``.
     expected = trust * (tails.nu + tracks.freedom) / (tails.nu + tracks.freedom + 2.0)
     return normal_equations(curve, tracks, Tails(NORMAL, tails.scale), prior, expected, drift=drift)
 

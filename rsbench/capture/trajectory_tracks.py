@@ -228,7 +228,11 @@ def _explain(curve: Curve, track: FloatArray, focal: FloatArray, s: Scratch) -> 
 @compiled(error_model="numpy")
 def _sees_disparity(track: FloatArray) -> bool:
     """Whether both cameras observe the point. The scale, and with it the sign of rho, is then not free."""
-    return bool(np.any(track[:, 9] != track[0, 9]))
+    other = 0  # np.any would load a module of Numba in each command
+    for n in range(len(track)):
+        if track[n, 9] != track[0, 9]:
+            other += 1
+    return other > 0
 
 
 @compiled(error_model="numpy")

@@ -19,8 +19,8 @@ Scheduler = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Dask scheduler whose workers do it, in place of --workers: tcp://host:8786 or a file.json. "
-        "All paths must be the same there (rsbench docs cluster).",
+        help="Dask scheduler to use instead of --workers: tcp://host:8786 or a file.json. Its workers "
+        "need the same paths (rsbench docs cluster).",
     ),
 ]
 

@@ -27,25 +27,25 @@ EPILOG = """[bold]Examples[/bold]
 
 RIG is a calibration of Kalibr, OpenCV, ROS, ZED, DepthAI, RealSense, COLMAP, Basalt or OpenVINS as it is, a file
 or a folder of files that belong together ([bold]rsbench rig RIG[/bold] shows what is understood), or rig.toml,
-here of two equal aligned cameras (pixels, metres; without readout_ratio and scan both are found):
+here of two equal aligned cameras (pixels, metres; readout_ratio and scan are estimated if missing):
 
   baseline = 0.12
   readout_ratio = 0.8        [dim]# readout time / frame period; or shutter = "gopro-hero6-4k30", of a real
                              # camera's mode (rsbench list shutters)[/dim]
   \\[camera]
-  fx = 812.3                 [dim]# focal_sigma = 8 beside it: not sure (812 +- 8), so it is found[/dim]
+  fx = 812.3                 [dim]# with focal_sigma = 8 (812 +- 8) it is estimated[/dim]
   fy = 812.3
   cx = 479.5
   cy = 269.5
   lens = { model = "brown-conrady", k1 = -0.2 }   [dim]# or kannala-brandt, rational, double-sphere[/dim]
-  k1_sigma = 0.02            [dim]# k1 = -0.2 +- 0.02, likewise[/dim]
+  k1_sigma = 0.02            [dim]# k1 = -0.2 +- 0.02 is estimated, too[/dim]
 
 Names: rsbench list solvers, matchers, features or correctors; a card's path ends in .toml.
 
 DIR gets [bold]report.html[/bold] (before and after), [bold]corrected/*.png[/bold], [bold]depth/*.exr[/bold]
-(of the corrected frames, metres), [bold]mask/*.png[/bold] (255 seen in the frame, 192 at a guessed depth, 128 from
-the other camera, 64 from the other frame, 32 a narrow hole closed from around it, 0 seen by nobody) and
-[bold]motion.json[/bold]."""
+(of the corrected frames, metres), [bold]mask/*.png[/bold] (255 visible in the frame, 192 at a guessed depth, 128
+from the other camera, 64 from the other frame, 32 a narrow hole filled from its surroundings, 0 visible in no
+frame) and [bold]motion.json[/bold]."""
 
 _OUT = "Folder or .mp4, .mov, .mkv, .avi. Default: NAME-corrected, for one camera's video .mp4."
 _SIDES = "Each frame shows both cameras of the rig side by side, the left one on the left."
@@ -129,7 +129,7 @@ def correct(
     ] = None,
     readout_ratio: Annotated[
         float | None,
-        typer.Option(help="Readout time divided by frame period, in place of that in the calibration."),
+        typer.Option(help="Readout time divided by frame period, instead of the calibration's."),
     ] = None,
     shutter: Annotated[
         str | None,

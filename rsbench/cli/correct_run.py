@@ -53,14 +53,14 @@ SUBTITLE = "Rolling shutter to global shutter"
 
 
 def motion_facts(motion: dict[str, Any] | None) -> list[tuple[str, str]]:
-    """What the page of four frames says of their motion."""
+    """Facts about the motion for the page of four frames."""
     if motion is None:
         return []
     names = "rotation in a frame period", "translation in a frame period"
     facts = [*zip(names, sizes(motion), strict=True)]
     if motion["model_choice"]:
         facts += [("motion model", motion["model_choice"]["text"])]
-    # Of each set of matches; those that the solver did not use are left out.
+    # Sets of matches that the solver did not use are left out.
     sets = ((name, inliers, motion["matches"][name]) for name, inliers in motion["inliers"].items())
     agreeing = ", ".join(f"{inliers} of {matches} {name}" for name, inliers, matches in sets if matches)
     noise = f"{motion['noise_px'] or float('nan'):.2f} px"
@@ -68,7 +68,7 @@ def motion_facts(motion: dict[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def camera_facts(record: dict[str, Any]) -> dict[str, str]:
-    """Of the record of one camera: its focal length, and the clock of its gyroscope."""
+    """Focal length and clock of the gyroscope, from the record of one camera."""
     focal, sigma = f"{record['camera']['fx']:.1f}", record["focal_length_sigma"]
     how = "found"
     if record["focal_length_assumed"]:

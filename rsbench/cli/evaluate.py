@@ -62,22 +62,26 @@ def evaluate(
     ] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="SOLVER|SEQUENCE", help="Predict nothing else; repeatable. All is scored."),
+        typer.Option(metavar="SOLVER|SEQUENCE", help="Predict only this; repeatable. All predictions are scored."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Predict again what is there already.")] = False,
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each solver, with other RANSAC samples.")] = 1,
+    force: Annotated[bool, typer.Option("--force", help="Repeat predictions that are up to date.")] = False,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each solver, with different RANSAC samples.")] = 1,
     seed: Annotated[int, typer.Option(help="Seed of every random choice.")] = 0,
     rehash: Annotated[
-        bool, typer.Option("--rehash", help="Read all data and score it again, not only what changed.")
+        bool, typer.Option("--rehash", help="Read and score all data again, not only what changed.")
     ] = False,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, help="Processes of one thread that predict and score a sequence each. Default: 1."),
+        typer.Option(min=1, help="Processes; each predicts and scores whole sequences. Default: 1."),
     ] = None,
     scheduler: Scheduler = None,
     layout: Annotated[
         str | None,
-        typer.Option("--from", metavar="LAYOUT", help="DIR is of others: carla-rs, colmap, euroc, fastec-rs, ..."),
+        typer.Option(
+            "--from",
+            metavar="LAYOUT",
+            help="Layout of DIR, if it is not rsbench's: carla-rs, colmap, euroc, fastec-rs, ...",
+        ),
     ] = None,
 ) -> None:
     """Score pose, depth and correction against the truth of a dataset, and write a report."""

@@ -62,10 +62,10 @@ def export(
         typer.Argument(metavar="DIR", help="Folder with a dataset.json, or of corrected footage (motion.json)."),
     ],
     to: Annotated[Target, typer.Option(help="Format; the document 'export' describes each.")],
-    out: Annotated[Path, typer.Option(help="Folder that appears when all is written.")],
+    out: Annotated[Path, typer.Option(help="Folder to write; it appears when it is complete.")],
     images: Annotated[
         Pictures | None,
-        typer.Option(help="Rolling-shutter frames or global-shutter twins, where a format takes either."),
+        typer.Option(help="Rolling-shutter or global-shutter frames, if the format supports both."),
     ] = None,
     sequence: Annotated[
         list[str] | None, typer.Option("--sequence", "--only", help="Only this sequence; repeatable.")
@@ -107,10 +107,11 @@ def view(
         typer.Option("--sequence", "--only", help="This sequence; repeatable. Default: the first one."),
     ] = None,
     save: Annotated[
-        Path | None, typer.Option(metavar="FILE.rrd", help="Write this file instead; of one sequence.")
+        Path | None,
+        typer.Option(metavar="FILE.rrd", help="Write one sequence to this file instead of opening the viewer."),
     ] = None,
-    points: Annotated[int, typer.Option(min=1, help="Points of each depth map, at most.")] = 100_000,
-    features: Annotated[str, named("features", "Matches of data without the channel matches.")] = "sift",
+    points: Annotated[int, typer.Option(min=1, help="Largest number of points per depth map.")] = 100_000,
+    features: Annotated[str, named("features", "Feature matcher, for data without the channel matches.")] = "sift",
 ) -> None:
     r"""Show a dataset in the Rerun viewer: rig, row poses, depth as points, images and matches over time.
 

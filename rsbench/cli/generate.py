@@ -36,7 +36,7 @@ EPILOG = """[bold]Examples[/bold]
 
   rsbench generate standard --out data/train --split train --sequences 1000 [dim](to train on)[/dim]
 
-  rsbench generate standard --out data/test --seed 20271 [dim](a split of the same card that nobody has seen)[/dim]
+  rsbench generate standard --out data/test --seed 20271 [dim](a split of the same card that was never used)[/dim]
 
   rsbench generate smoke --out data/stack --full-frames    [dim](keeps every row's whole image)[/dim]"""
 _Channels = Annotated[
@@ -67,7 +67,8 @@ def generate(
         list[str] | None, typer.Option("--sequence", "--only", help="Only this sequence of the card; repeatable.")
     ] = None,
     shard: Annotated[
-        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts of the sequences: one machine's.")
+        str | None,
+        typer.Option(metavar="I/N", help="Only the I-th of N parts of the sequences, for one of N machines."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes; each renders whole sequences. Default: 1.")
@@ -86,7 +87,7 @@ def generate(
     ] = None,
     seed: Annotated[
         list[int] | None,
-        typer.Option(min=0, help="In place of the card's seeds: other motions and noise. Repeatable."),
+        typer.Option(min=0, help="Seed to use instead of the card's, for other motions and noise; repeatable."),
     ] = None,
     split: Annotated[
         str | None,
@@ -101,18 +102,19 @@ def generate(
         typer.Option(
             min=1,
             max=100_000,
-            help="With --split: how many, in place of as many as the card has; beyond these it is drawn again, "
-            "with other scenes.",
+            help="With --split: number of sequences. Default: as many as the card has; beyond these, other "
+            "scenes are drawn.",
         ),
     ] = None,
     rehash: Annotated[
         bool,
-        typer.Option("--rehash", help="Read all that is there again, not only what has another size or time."),
+        typer.Option("--rehash", help="Read all existing files again, not only those whose size or time changed."),
     ] = False,
     estimate: Annotated[
         bool,
         typer.Option(
-            "--estimate", help="Only say how many files, bytes and minutes; tries one camera of each scene."
+            "--estimate",
+            help="Only estimate the number of files, bytes and minutes, by rendering one camera of each scene.",
         ),
     ] = False,
     backend: Annotated[

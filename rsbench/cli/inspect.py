@@ -55,10 +55,12 @@ def inspect(
         typer.Option(help="Frames per second, for a calibration's line delay. Default: that of the video."),
     ] = None,
     readout_ratio: Annotated[
-        float | None, typer.Option(help="Readout time over frame period, to compare with, in place of the rig's.")
+        float | None,
+        typer.Option(help="Readout time divided by frame period, to compare with, instead of the rig's."),
     ] = None,
     shutter: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The same from a mode: rsbench list shutters.")
+        str | None,
+        typer.Option(metavar="NAME", help="The same, by the name of a camera mode (rsbench list shutters)."),
     ] = None,
 ) -> None:
     """Estimate scan direction, readout ratio and delay of each camera from matches, where they tell it."""

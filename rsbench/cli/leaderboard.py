@@ -65,7 +65,7 @@ board_app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
     epilog=EPILOG,
-    help="Score predictions on tracks and rank them with intervals; predictions come from any language.",
+    help="Score predictions on tracks and rank them with intervals; predictions may come from any language.",
 )
 
 Track = Annotated[
@@ -83,7 +83,7 @@ Data = Annotated[
     ),
 ]
 Secret = Annotated[
-    Path | None, typer.Option("--seed-file", metavar="FILE", help="Text from which a secret test split is drawn.")
+    Path | None, typer.Option("--seed-file", metavar="FILE", help="Secret text from which a test split is drawn.")
 ]
 Hidden = Annotated[
     bool, typer.Option("--secret", help="The dataset's truth is secret: not exported, and not used by check.")
@@ -108,7 +108,7 @@ def export(
     seed_file: Secret = None,
     secret: Hidden = False,
 ) -> None:
-    """Write the inputs of a track for any language; of a public split the truth too."""
+    """Write the inputs of a track for any language and, for a public split, the truth."""
     from rsbench.benchmark.leaderboard.inputs import check_place, write_frames, write_inputs
     from rsbench.storage.work_folder import work_folder
 
@@ -127,9 +127,9 @@ def template(
     track: Track,
     data: Data = None,
     seed_file: Secret = None,
-    out: Annotated[Path | None, typer.Option(help="New folder for it; needed on tracks of pictures.")] = None,
+    out: Annotated[Path | None, typer.Option(help="New folder; needed for tracks of images.")] = None,
 ) -> None:
-    """Print a file of predictions that is in order: fill in your own."""
+    """Print a valid file of predictions, to fill in."""
     from rsbench.benchmark.leaderboard.submissions import write_template
 
     split = split_of(track, data, seed_file)
@@ -169,7 +169,7 @@ def submit(
     data: Data = None,
     seed_file: Secret = None,
     secret: Hidden = False,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace an entry of the same name.")] = False,
     workers: Workers = 1,
 ) -> None:
     """Score a file of predictions and add it to a board."""
@@ -199,7 +199,7 @@ def run(
     seed_file: Secret = None,
     secret: Hidden = False,
     problems: Annotated[
-        int | None, typer.Option(min=1, help="Only the first ones: a split of its own on the board.")
+        int | None, typer.Option(min=1, help="Only the first problems; they are a separate split on the board.")
     ] = None,
     stored: Annotated[
         Path | None,
@@ -213,14 +213,19 @@ def run(
     workers: Annotated[int | None, typer.Option(min=1, help="Processes. Default: one per core.")] = None,
     scheduler: Scheduler = None,
     time_limit: Annotated[
-        float | None, typer.Option(min=0.001, help="Seconds per problem; what takes longer is a failure.")
+        float | None,
+        typer.Option(min=0.001, help="Time limit per problem, seconds; beyond it the problem counts as failed."),
     ] = None,
     memory: Annotated[
         float | None,
-        typer.Option(min=1.0, metavar="MB", help="What a method's process may use; more is a failure."),
+        typer.Option(
+            min=1.0,
+            metavar="MB",
+            help="Memory limit of a method's process; beyond it the problem counts as failed.",
+        ),
     ] = None,
 ) -> None:
-    """Run cards on a track, keep what they predict, and score it. An interrupted run goes on there."""
+    """Run cards on a track, keep their predictions, and score them. An interrupted run resumes."""
     from rsbench.benchmark.leaderboard.board import RUN, add_all, made_by
     from rsbench.benchmark.leaderboard.inputs import prepare_inputs
     from rsbench.benchmark.leaderboard.running import count_steps, load_cards, run_cards
@@ -284,11 +289,12 @@ def _stored(whole: Split, split: Split, folder: Path | None) -> list[Scored]:
 @board_app.command()
 def show(
     board: _Board,
-    track: Annotated[str | None, typer.Option(help="Of this track only.")] = None,
+    track: Annotated[str | None, typer.Option(help="Only this track.")] = None,
     at_most: Annotated[
-        str | None, typer.Option("--uses", help="Entries that use no more than these, with commas between.")
+        str | None,
+        typer.Option("--uses", help="Only entries that use no other inputs than these, separated by commas."),
     ] = None,
-    csv: Annotated[bool, typer.Option("--csv", help="All numbers as CSV.")] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="Print all numbers as CSV.")] = False,
 ) -> None:
     """Print the tables of a board."""
     from rsbench.benchmark.leaderboard.board import splits_of
@@ -321,7 +327,7 @@ def build(
     board: _Board,
     out: Annotated[Path, typer.Option(help="Folder of the site.")],
     data: Annotated[
-        list[Path] | None, typer.Option(metavar="DIR", help="Dataset whose pictures to show; repeatable.")
+        list[Path] | None, typer.Option(metavar="DIR", help="Dataset whose images are shown; repeatable.")
     ] = None,
 ) -> None:
     """Write the board as a static site, with each table as CSV, Markdown and LaTeX."""
@@ -334,7 +340,7 @@ def build(
 def merge(
     other: Annotated[Path, typer.Argument(metavar="OTHER", help="Board to copy from.")], board: _Board
 ) -> None:
-    """Copy the entries of another board that this one lacks."""
+    """Copy missing entries from another board."""
     from rsbench.benchmark.leaderboard.board import merge
 
     for name in merge(other, board):
@@ -351,11 +357,11 @@ def rescore(
     stored: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="Make the board of these predictions, as results/laws/predictions/pose-2."
+            metavar="DIR", help="Make the board from these predictions, such as results/laws/predictions/pose-2."
         ),
     ] = None,
 ) -> None:
-    """Score the stored predictions again and say which scores changed; runs no method."""
+    """Score the stored predictions again and list the scores that changed; no method is run."""
     from rsbench.benchmark.leaderboard.board import rescore, restore
 
     split = split_of(track, data, seed_file)
@@ -388,12 +394,12 @@ def smoke(
     ] = None,
     data: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="The dataset leaderboard-smoke, if you have it. Default: render it."),
+        typer.Option(metavar="DIR", help="The dataset leaderboard-smoke; default: it is rendered."),
     ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
     write: Annotated[bool, typer.Option("--write", help="Store the scores instead of comparing.")] = False,
 ) -> None:
-    """Run a few entries of each track on small problems again, and name each score that is not the stored one.
+    """Run a few entries of each track on small problems, and list the scores that differ from the stored ones.
 
     Exit code 1: there is one.
     """
@@ -429,23 +435,21 @@ def smoke(
         raise typer.Exit(1)
 
 
-# Of the keeper of a board
+# Commands for those who host a board
 
 
 @board_app.command()
 def publish(
     track: Annotated[str, typer.Argument(help="A track of frames, such as pose or pose-own.")],
     seed_file: _Seed,
-    keep: Annotated[
-        Path, typer.Option(metavar="DIR", help="The keeper's folder: scenes and truth, not to be shown.")
-    ],
-    out: Annotated[Path, typer.Option(help="Folder of what everybody may see.")],
+    keep: Annotated[Path, typer.Option(metavar="DIR", help="Folder for scenes and truth, to be kept secret.")],
+    out: Annotated[Path, typer.Option(help="Folder to publish.")],
     card: Annotated[
         str, typer.Option(metavar="CARD", help="Dataset card of the split.", autocompletion=complete("datasets"))
     ] = "standard",
     workers: Annotated[int, typer.Option(min=1, help="Processes; each renders whole sequences.")] = 1,
 ) -> None:
-    """Render a secret test split, and write its inputs without truth. Run again, it proves what was announced."""
+    """Render a secret test split and write its inputs without truth. A second run reproduces it."""
     from rsbench.benchmark.leaderboard import publishing
     from rsbench.benchmark.leaderboard.tracks import track_of_name
     from rsbench.dataset.generation import steps_of
@@ -469,16 +473,18 @@ def publish(
 def score(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Predictions: JSON lines.")],
     seed_file: _Seed,
-    published: Annotated[Path, typer.Option(metavar="DIR", help="Folder that publish wrote for everybody.")],
+    published: Annotated[Path, typer.Option(metavar="DIR", help="Folder that publish wrote, --out.")],
     board: Annotated[Path, typer.Option(help="Folder of the board.")],
-    card: Annotated[str | None, typer.Option(metavar="CARD", help="Where its card is not rsbench's own.")] = None,
-    keep: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="The keeper's folder, where the truth is depth or frames.")
+    card: Annotated[
+        str | None, typer.Option(metavar="CARD", help="Dataset card of the split, if it is not rsbench's.")
     ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Secret folder of publish, if the truth is depth or frames.")
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace an entry of the same name.")] = False,
     workers: Workers = 1,
 ) -> None:
-    """Draw the truth of a secret split from its text again, see that it is the announced one, and score."""
+    """Draw the truth of a secret split from its text, check that it is the announced one, and score."""
     from rsbench.benchmark.leaderboard.publishing import announced_split, read_announcement
     from rsbench.benchmark.leaderboard.tracks import track_of_id
     from rsbench.dataset.secret_split import read_secret
@@ -497,9 +503,11 @@ def accept(
     board: Annotated[Path, typer.Option(help="Folder of the board.")],
     protocol: Annotated[str, typer.Option(metavar="ID", help="Such as points-1.")],
     split: Annotated[str, typer.Option(metavar="NAME", help="Such as dev-f88c896f.")],
-    reason: Annotated[str, typer.Option(metavar="TEXT", help="Why it is believed; kept in its entry.json.")],
+    reason: Annotated[
+        str, typer.Option(metavar="TEXT", help="Why the entry is accepted; stored in its entry.json.")
+    ],
 ) -> None:
-    """Rank an entry that is in doubt, its errors being below what its data allow."""
+    """Rank an entry whose errors are below what its data allow."""
     from rsbench.benchmark.leaderboard import board as boards
 
     if not reason.strip():

@@ -109,7 +109,7 @@ def list_(
     kind: Annotated[
         str | None, typer.Argument(help="What to list; without it, the kinds.", autocompletion=complete_kind)
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="As a JSON list.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
 ) -> None:
     """List scenes, solvers, datasets and so on, with the cards to copy and edit, and who they come from."""
     from rsbench.components.cards import choices
@@ -182,15 +182,15 @@ SHOW_EPILOG = """[bold]Examples[/bold]
 def show(
     name: Annotated[
         str,
-        typer.Argument(metavar="NAME|CARD", help="A name, or the path of a card.", autocompletion=complete()),
+        typer.Argument(metavar="NAME|CARD", help="Name, or path of a card.", autocompletion=complete()),
     ],
     kind: Annotated[
         str | None,
         typer.Option(
-            help="Its kind (rsbench list), where more than one has the name.", autocompletion=complete_kind
+            help="Kind (see rsbench list), if several kinds have this name.", autocompletion=complete_kind
         ),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="As one JSON object.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print what a solver needs and returns, the parameters of a component with defaults, or a card."""
     found = [_about(name, each) for each in _kinds_of(name, kind)]

@@ -146,11 +146,11 @@ def reproduce(
         int | None,
         typer.Option(
             min=1,
-            help="Runs of each solver, with other samples; default: 20 of images and 10 of real.",
+            help="Runs of each solver, with different RANSAC samples; default: 20 for images, 10 for real.",
             show_default=False,
         ),
     ] = None,
-    width: Annotated[int | None, typer.Option(help="Of real: width of the images; default: the card's.")] = None,
+    width: Annotated[int | None, typer.Option(help="For real: width of the images; default: the card's.")] = None,
 ) -> None:
     """Make the committed results again: render or simulate what is missing, run, score, draw."""
     from rsbench.storage.files import check_out

@@ -102,7 +102,7 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
     images, bands, motions = (pd.concat(table, ignore_index=True) for table in zip(*studies, strict=True))
     write_table(folder / "views.csv", images)
     write_table(folder / "motions.csv", motions)
-    # Of the stored figures, so that whoever has the file can make the summary again to the last digit.
+    # From the stored figures, so that the summary can be made again from the file to the last digit.
     stored = pd.read_csv(folder / "views.csv")
     write_table(folder / "summary.csv", summarise(stored))
     write_table(folder / "scenes.csv", by_scene(stored))
@@ -181,7 +181,7 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
         )
     write_table(folder / "motions.csv", motions)
     write_table(folder / "views.csv", views)
-    # Of the stored figures, so that whoever has the files can make the summary again to the last digit.
+    # From the stored figures, so that the summary can be made again from the files to the last digit.
     stored = (
         pd.read_csv(folder / f"{name}.csv", keep_default_na=False, na_values=[""]) for name in ("motions", "views")
     )

@@ -41,29 +41,32 @@ def rig(
     to: Annotated[
         str | None, typer.Option(metavar="FORMAT", help="Convert: rig.toml, kalibr, opencv, ros or colmap.")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="PATH", help="Where the converted file goes.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", metavar="PATH", help="Converted file.")] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the images, where the file does not say.")
+        str | None, typer.Option(metavar="WxH", help="Size of the images, if the file does not have it.")
     ] = None,
     resize: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Of the same images scaled to another size.")
+        str | None, typer.Option(metavar="WxH", help="Convert for images scaled to this size.")
     ] = None,
     crop: Annotated[
-        str | None, typer.Option(metavar="WxH+X+Y", help="Of frames cropped to this size from column X and row Y.")
+        str | None,
+        typer.Option(metavar="WxH+X+Y", help="Convert for images cropped to this size from column X and row Y."),
     ] = None,
     unit: Annotated[
-        str | None, typer.Option(metavar="UNIT", help="Of lengths: m, cm, mm, inch, or metres, such as 0.025.")
+        str | None,
+        typer.Option(metavar="UNIT", help="Unit of lengths: m, cm, mm, inch, or metres, such as 0.025."),
     ] = None,
     lens: Annotated[
-        str | None, typer.Option(metavar="MODEL", help="Of four coefficients: brown-conrady or kannala-brandt.")
+        str | None,
+        typer.Option(metavar="MODEL", help="Lens model of four coefficients: brown-conrady or kannala-brandt."),
     ] = None,
     invert: Annotated[bool, typer.Option("--invert", help="The file's transform is the inverse.")] = False,
     exchange: Annotated[
         bool, typer.Option("--exchange", help="The file's second camera is the left one.")
     ] = False,
-    fps: Annotated[float | None, typer.Option(help="Frames a second: makes line delays readout ratios.")] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Frames per second, to convert line delays to readout ratios.")
+    ] = None,
     picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the rig: .svg, .png or .pdf.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print what was understood as one JSON object.")] = False,
 ) -> None:

@@ -61,7 +61,7 @@ def simulate(
     time_limit: Annotated[
         float | None,
         typer.Option(
-            min=0.001, help="Seconds per problem for solvers of other packages, instead of their cards'."
+            min=0.001, help="Time limit per problem for solvers of other packages, seconds; default: their cards'."
         ),
     ] = None,
     force: Annotated[

@@ -40,11 +40,11 @@ def compile_(
     portable: Annotated[
         bool,
         typer.Option(
-            "--portable", help="For every x86-64-v3 processor, into the package, which brings it to others."
+            "--portable", help="Compile for all x86-64-v3 processors, into the package, before a wheel is built."
         ),
     ] = False,
 ) -> None:
-    """Compile now what the first commands would compile, into a cache on disk: a minute."""
+    """Compile the numerical code in advance, into a cache on disk; takes a minute."""
     from rsbench.cli.compile_ahead import PARTS, compile_now, compile_portable
 
     if portable:
@@ -80,9 +80,9 @@ DOCS_EPILOG = """[bold]Examples[/bold]
 
 
 def docs(
-    name: Annotated[str | None, typer.Argument(help="A document or example; its path is printed.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Document or example whose path is printed.")] = None,
 ) -> None:
-    """List the documents and examples that come with rsbench, or print where one of them is."""
+    """List the documents and examples of rsbench, or print the path of one."""
     from rsbench.components.cards import choices
 
     documents = list_documents()
@@ -138,9 +138,9 @@ def check_solver(
         ),
     ],
     time_limit: Annotated[
-        float | None, typer.Option(min=0.1, help="Seconds for one problem; by default those of the card.")
+        float | None, typer.Option(min=0.1, help="Time limit per problem, seconds; default: the card's.")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Findings as one JSON object.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the findings as one JSON object.")] = False,
 ) -> None:
     """Check the contract of a solver: exact data solved, equal results of equal runs, failures as values."""
     import pandas as pd

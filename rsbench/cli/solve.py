@@ -39,7 +39,7 @@ Exit codes: 0 all solved, 1 one without a motion, 2 one that is wrong; the other
 More: [bold]rsbench docs problem-format[/bold]"""
 
 
-_MODEL = "Motion model: auto, which the matches prefer, or a name. Default: auto where the solver takes it"
+_MODEL = "Motion model: a name, or auto for the most probable one. Default: auto if the solver supports it"
 _SOLVER = "Solver: name (rsbench list solvers), card or FILE.py; repeatable. Default: rs-stereo-refined"
 
 
@@ -48,26 +48,28 @@ def solve(
         list[str] | None,
         typer.Argument(
             metavar="PROBLEM",
-            help="Files (.json; .jsonl, one problem per line; .npz), folders of such, or - for standard input.",
+            help="Files (.json; .jsonl, one problem per line; .npz), folders of them, or - for standard input.",
         ),
     ] = None,
     solver: Annotated[list[str] | None, named("solvers", _SOLVER)] = None,
     threshold_px: Annotated[
-        float | None, typer.Option(help="Largest Sampson error of an inlier, px. Default: follows the noise.")
+        float | None, typer.Option(help="Largest Sampson error of an inlier, px. Default: adapted to the noise.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of RANSAC's sampling.")] = 0,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object per line and answer.")] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object per answer, each on a line.")
+    ] = False,
     extras: Annotated[
         str,
-        typer.Option("--with", help="More in each JSON answer: covariance, noise, inliers; with commas between."),
+        typer.Option(
+            "--with", help="Further fields of each JSON answer: covariance, noise, inliers; separated by commas."
+        ),
     ] = "",
     motion_model: Annotated[str | None, typer.Option(metavar="auto|NAME", help=_MODEL)] = None,
     time_limit: Annotated[
-        float | None, typer.Option(help="Seconds that another package's solver may take for a problem.")
+        float | None, typer.Option(help="Time limit per problem for solvers of other packages, seconds.")
     ] = None,
-    example: Annotated[
-        bool, typer.Option("--example", help="Print a sample problem and do nothing else.")
-    ] = False,
+    example: Annotated[bool, typer.Option("--example", help="Print a sample problem and exit.")] = False,
 ) -> None:
     """Estimate the motion of a stereo rig from your own matches."""
     if example:

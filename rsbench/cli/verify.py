@@ -44,7 +44,7 @@ def verify(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with a dataset.json.")],
     stride: Annotated[int, typer.Option(min=1, help="Compare every n-th pixel in both directions.")] = 1,
     rerender: Annotated[
-        Rerender, typer.Option(help="Rows to render again where the scene can be built here: auto takes seconds.")
+        Rerender, typer.Option(help="Rows to render again, if the scene can be built here; auto takes seconds.")
     ] = Rerender.AUTO,
     scene: Annotated[
         list[str] | None, named("scenes", "Card, or moving mesh, that is not rsbench's own; repeatable.")
@@ -55,13 +55,13 @@ def verify(
     ] = False,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, help="Processes that check a sequence each, with a scene each. Default: 1."),
+        typer.Option(min=1, help="Processes; each checks whole sequences. Default: 1."),
     ] = None,
     reference: Annotated[
         bool,
         typer.Option(
             "--reference",
-            help="Compare with the reference copy too, which rsbench has of standard: the same bytes, or alike.",
+            help="Also compare with rsbench's reference copy of the card standard: equal bytes or similar images.",
         ),
     ] = False,
     layout: Annotated[
@@ -69,7 +69,7 @@ def verify(
         typer.Option(
             "--from",
             metavar="LAYOUT",
-            help="Layout of DIR, where it is not rsbench's: carla-rs, colmap, euroc, fastec-rs, ...",
+            help="Layout of DIR, if it is not rsbench's: carla-rs, colmap, euroc, fastec-rs, ...",
         ),
     ] = None,
 ) -> None:
@@ -175,7 +175,7 @@ Exit codes: 0 done, 1 a digest differs, 2 an input is wrong."""
 def digest(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with a dataset.json.")],
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Where the digests go. Default: standard output.")
+        Path | None, typer.Option(metavar="FILE", help="File for the digests. Default: standard output.")
     ] = None,
     check: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Digests of an earlier copy, to compare with.")

@@ -152,7 +152,7 @@ def world_points(points: ArrayLike) -> FloatArray:
     array = real_array("points", points)
     if array.ndim == 0 or array.shape[-1] != 3:
         raise ValueError(f"points: must have shape (..., 3), got {array.shape}")
-    far = np.abs(array) > LARGEST_M  # NaN is no point, and seen by nobody
+    far = np.abs(array) > LARGEST_M  # NaN is no point, and not visible
     if np.any(far):
         raise ValueError(f"points: must lie within {LARGEST_M:g} m, got {array[far][0]:g}")
     return array

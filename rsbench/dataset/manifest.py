@@ -350,7 +350,7 @@ def check_same(place: object, manifest: Plan, plan: Plan, scene_sha256: str) -> 
 
 
 def hashes_in(manifest: Plan) -> dict[str, Any]:
-    """What a sequence.json says of its files: hashes by path, which nobody has checked."""
+    """Hashes of the files of a sequence by path, from its sequence.json; not checked."""
     listed = manifest.get("files")
     return listed if isinstance(listed, dict) else {}
 

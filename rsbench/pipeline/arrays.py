@@ -118,11 +118,11 @@ def of_one_camera(
 
 
 def matches_of(frames: Sequence[Any], rig: StereoRig, features: str) -> list[Correspondences]:
-    """Of each two successive times; frames are (left, right) images.
+    """Matches of each two successive frame times; frames are (left, right) images.
 
     Raises:
-        ValueError: not two images of each time, not of the rig's size, or of one time only.
-        RsbenchError: no such feature matcher.
+        ValueError: a time does not have two images, their size is not the rig's, or there is only one time.
+        RsbenchError: there is no such feature matcher.
     """
     options = CorrectionOptions(features=load_features(features))
     for number, both in enumerate(frames):

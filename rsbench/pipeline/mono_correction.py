@@ -460,8 +460,8 @@ def _trajectory_motions(run: Sequence[SeenPair], rig: StereoRig, shutter: Rollin
 def _global_shutter_motion(matches: FloatArray, camera: PinholeCamera) -> LinearMotion:
     """The motion of a global-shutter camera (OpenCV's MAGSAC++ and five points); no motion if none is found.
 
-    Its sign of d is arbitrary. Of the two rotations of an essential matrix the smaller one is used: cameras of
-    successive frames do not turn by more than 90 degrees.
+    Its sign of d is arbitrary. An essential matrix has two rotations; the smaller one is used, as a camera does
+    not turn by more than 90 degrees between successive frames.
     """
     first, second = (camera.fx * camera.unproject(matches[:, k : k + 2])[:, :2] for k in (0, 2))
     seen = np.all(np.isfinite(first + second), axis=-1)  # a lens may show no ray at a match

@@ -143,10 +143,10 @@ def _stitched(
     rows: Sequence[int],
     on_gs_frame: OnGlobalFrame | None,
 ) -> Frame:
-    """One global-shutter camera per row. Without ``full_frames`` only the kept row of each is traced.
+    """Render one global-shutter camera per row. Without ``full_frames`` only the kept row of each is traced.
 
-    The pixels of that row keep their index in the full frame, hence their random numbers, and their neighbours in
-    a packet, hence their rounding: they have the bits of the whole image. Of columns, all rows are traced.
+    The pixels of that row keep their index in the full frame, and so their random numbers, and their neighbours in
+    a packet, and so their rounding: they have the bits of the whole image. For columns, all rows are traced.
     """
     tracer, columns = _tracer(), poses[0].columns
     sensors = [_sensor(camera, each) for each in poses]

@@ -166,8 +166,8 @@ _LEGEND = {
     Origin.GUESSED: "seen in this frame, depth guessed from neighbours",
     Origin.OTHER_CAMERA: "from the other camera",
     Origin.OTHER_FRAME: "from the other frame",
-    Origin.INVENTED: "seen by nobody, closed from around",
-    Origin.NOBODY: "seen by nobody",
+    Origin.INVENTED: "visible in no frame, filled from its surroundings",
+    Origin.NOBODY: "visible in no frame",
 }
 _LONGEST = 900
 

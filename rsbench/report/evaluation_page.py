@@ -122,7 +122,7 @@ def _draw_corrected(folder: Path, chosen: dict[str, str], truth: Image) -> Drawn
     return {
         "corrected": (
             pictures.masked(corrected, mask),
-            "Corrected frame (dark: seen by nobody); hover: global-shutter truth",
+            "Corrected frame (dark: visible in no frame); hover: global-shutter truth",
         ),
         "corrected-over-global": (
             pictures.overlay(corrected, truth, mask),

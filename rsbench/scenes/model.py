@@ -21,8 +21,9 @@ from rsbench.core.errors import RsbenchError
 
 FloatArray = NDArray[np.float64]
 SMOOTHEST, ROUGHEST = 0.05, 0.5
-"""Of glossy surfaces. A mirror's picture of the sun is a point that no pixel can show; and above a half the model,
-which follows no light from facet to facet, loses more than it mirrors: that is paint, and diffuse."""
+"""Least and largest roughness of glossy surfaces. A smoother surface mirrors the sun as a point that pixels cannot
+show; above 0.5 the model, which has no interreflection between facets, loses more light than it mirrors: such
+surfaces are diffuse."""
 _UNIT = 1e-6
 """Quaternions may be longer or shorter than 1 by this much: rounding in a file."""
 

@@ -15,7 +15,7 @@ F. Fraundorfer, P. Tanskanen, M. Pollefeys, A Minimal Case Solution to the Calib
 the Case of Two Known Orientation Angles, ECCV 2010, for a global shutter: with the rays of both frames turned
 so that gravity points along y, one angle about y is left of the rotation, and three matches of one camera give
 it and the direction of the translation. On a rig, as a generalised camera of known vertical, four matches give
-the length of the translation too. The minimal solvers are PoseLib's. Of many matches of one camera,
+the length of the translation too. The minimal solvers are PoseLib's. For many matches of one camera,
 
     n . T = 0,   n = R x cross y,   R = A1^T R_y(angle) A0
 
@@ -54,7 +54,7 @@ _CONTRADICTED = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSolver(Solver):
-    """Of one camera or of both, whose rotation another sensor shows in part."""
+    """Solver for one camera or both, whose rotation is partly given by another sensor."""
 
     cameras_used: Literal["left", "both"] = "left"
     """The left camera's own motion without a length, or the rig's in metres."""

@@ -283,8 +283,8 @@ def length_from_tracks(tracks: FloatArray, packed: Packed, w: FloatArray, u: Flo
     """Signed length, metres, of a translation along u (3,) for a known rotation, from tracks; or None.
 
     A left-right match holds its point's inverse depth rho, so that ``y x (R x + rho s T(u)) = 0`` is linear in the
-    length s; one least-squares quotient over all tracks. Of tracks (n, 4, 9), whose ends have a time each, the
-    equations of the four rays are linear in s and the point, which is eliminated.
+    length s, which is one least-squares quotient over all tracks. If each end of a track has its own time (tracks
+    (n, 4, 9)), the equations of the four rays are linear in s and the point, which is eliminated.
     """
     if tracks.ndim == 3:
         return _length_from_rays(tracks, packed.baseline, w, u)

@@ -522,7 +522,7 @@ def warm_up(motion_models: Iterable[str] = ("linear",)) -> None:
     Call it before workers start, so that they find the code on disk, and in each of them before a clock starts.
 
     Raises:
-        RsbenchError: a motion model that does not exist. Of one without a kernel there is nothing to compile.
+        RsbenchError: there is no such motion model. For a model without a kernel, nothing is compiled.
     """
     rig = StereoRig(camera=PinholeCamera.centred(64, 64, 60.0), baseline=1.0)
     shutter = RollingShutter(height=64, readout_ratio=0.5)

@@ -151,7 +151,7 @@ def vote_rows(
         span: of the target, the smallest and largest codes (H, W, 3) of the 3 x 3 pixels around each; how far
             beyond is allowed.
         votes: of the source, see ``image_checks.compare``.
-        bands: number of the band (H,) of each row; (2, B) filled in by nobody, for its shape.
+        bands: number of the band (H,) of each row; (2, B) not used, for its shape.
         first, last: of the strided rows, without the last.
 
     Returns:

@@ -256,8 +256,8 @@ def compare(
 def _costs(
     shown: Shown, target: Picture, bands: NDArray[np.int64], pixels: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Of the capped difference from what the target shows, means over pixels of each band: (C, B) of each change,
-    (C, B) standard errors of its gain over none, (B,) of the band's middle colour. Some of the ``pixels`` do."""
+    """Means over the pixels of each band of the capped difference from the target, measured at some of ``pixels``:
+    (C, B) after each change, (C, B) standard errors of the change's gain, (B,) for the band's middle colour."""
     every, count = max(1, pixels // _SAMPLES), int(bands[-1]) + 1
     y, x, seen = sampled(shown, target, pixels, every)
     of, places = bands[y], np.stack([y, x], axis=1)

@@ -357,7 +357,7 @@ def _rays(scene: MitsubaScene, objects: Many[MovingObject] = ()) -> SceneRays:
 
 
 def _rows_of(mode: Rerender, sequence: Sequence, options: RendererOptions) -> dict[Side, list[int]]:
-    """One row of each of equal bands, drawn by the hash of the images: nobody knows them before they are.
+    """One row of each of equal bands, drawn by the hash of the images, so that they cannot be known before these.
 
     Those of each camera; the same where these have the same height.
     """

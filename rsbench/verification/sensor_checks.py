@@ -50,9 +50,9 @@ _NEAR = 1.5
 that of a bright neighbour counts up to twice."""
 _COARSE, _OFF = 4, 1.25
 """The smallest step at which a coefficient is judged, and how far it may be from whole steps: six standard
-deviations of what rounding to codes leaves where it differs from pixel to pixel. Of those that were not rounded to
-a step of 4, a third are farther off. Where values of a block repeat, as in equal rows, so do their rounding
-errors, which add up: more is allowed, by the root of how often each value is there."""
+deviations of the errors by rounding to codes, if these are independent. A third of the coefficients that were not
+rounded to a step of 4 are farther off. If values of a block repeat, as in equal rows, their rounding errors add
+up: the limit is multiplied by the root of the number of repetitions."""
 _OPEN = 125.0
 """Luminance about grey beyond which it may have been cut off."""
 _FIRST = 1.0 / np.sqrt(2.0)
@@ -115,7 +115,7 @@ def _not_means(image: NDArray[np.uint8], mosaic: Mosaic) -> _Counts:
             for kernel in _KERNELS
         )
         level, upright = (np.any(own == channel, axis=axis, keepdims=True) for axis in (1, 0))
-        # Of two directions the camera has chosen one, by numbers that rounding has changed.
+        # The camera chose one of two directions by numbers that rounding has changed since: either is right.
         right = np.where(level | upright, (across & level) | (down & upright), corners)
         judged = inner & (own != channel)
         wrong += np.sum(judged & ~right, axis=1)

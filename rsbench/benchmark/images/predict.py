@@ -88,7 +88,7 @@ class Bench:
                 self.move(entry)
                 step(f"{self.sequence.name}: {entry.name}")
         if self.plan.corrects:
-            # Of other cameras a pair has no disparity of one time.
+            # If the cameras read rows at different times, a pair has no disparity of one time.
             if self.sequence.shutter.rows_together or needs_motion(self.plan.chain.matcher):
                 self._find_depth()
             step(f"{self.sequence.name}: depth")

@@ -55,7 +55,7 @@ def misreading(
         rig: the cameras.
         point: the reference point of the solver.
     """
-    # Of the angle of rotation, and in radians.
+    # The error of the rotation divided by its angle, and the angle between the translations in radians.
     errors = {
         words: max(
             float(rotation_error(w, wrong_w)) / max(float(np.linalg.norm(true_w)), 1e-12),

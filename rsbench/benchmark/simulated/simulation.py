@@ -360,8 +360,8 @@ class MovingRig:
     def _slower_than_readout(self, side: Side, frame: int, points: FloatArray) -> NDArray[np.bool_]:
         """Mask (n,) of points whose image provably never moves as fast as half the speed of the readout.
 
-        Then the row equation falls at every crossing, so it has at most one. Of a motion that knows no bound of
-        its speed over the frame, none is.
+        Then the row equation decreases at every zero, so it has at most one. If the motion has no bound of its
+        speed over the frame, the mask is False.
         """
         rig, shutter, camera = self.rig, self.shutter, self.rig.camera
         none = np.zeros(len(points), dtype=np.bool_)

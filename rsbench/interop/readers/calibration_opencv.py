@@ -1,8 +1,8 @@
 """Calibrations that consist of OpenCV's matrices: its own files, and camera_info of ROS.
 
 **OpenCV** (FileStorage): x2 = R x1 + T, T in the unit of the board's squares, and no size of the images in the
-samples' files. Names of keys are a matter of taste; a rotation may be a vector. Of rectified files alone, R = R2^T
-R1 and T = R2^T (P2[0, 3], P2[1, 3], 0) / f.
+samples' files. Keys have various names, and a rotation may be a vector. If a file has only rectified cameras,
+R = R2^T R1 and T = R2^T (P2[0, 3], P2[1, 3], 0) / f.
 
 **ROS** (camera_info of both cameras): extrinsics exist only as the rectification R of both and P[0, 3] = -f B.
 """

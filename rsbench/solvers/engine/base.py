@@ -122,10 +122,10 @@ class SolverSpec:
     assumes: str
     """Its assumptions, in words."""
     cameras: Cameras = "ideal"
-    """What it takes beside equal aligned cameras without a lens that read rows from the top at the same times: a
-    lens; other scans and a late right camera too; or any rig. It then has times from ``shutter.pixel_time`` alone
-    and rays from ``camera.unproject``, of any rig from ``rig.eye(side).unproject``. Of a global shutter it
-    does not matter: unless it says ``rig``, matches and rig are those of an ideal rig that sees the same."""
+    """Cameras that it supports besides equal aligned ones without a lens that read rows from the top at the same
+    times: a lens; also other scans and a late right camera; or any rig. It then gets times from
+    ``shutter.pixel_time`` alone and rays from ``camera.unproject`` or, for any rig, ``rig.eye(side).unproject``.
+    A global-shutter solver without ``rig`` gets the matches and the rig as an ideal rig would see them."""
     motion_parameters: Mapping[str, Any] = field(default_factory=dict)
     """The motion model's own parameters that it assumes; absent ones have the model's defaults."""
 
@@ -510,7 +510,7 @@ def load_solver_entries(names_or_paths: Sequence[str]) -> list[SolverEntry]:
     """Several solvers that go into one table.
 
     Raises:
-        RsbenchError: see ``load_solver``; or two of them have one name, by which nobody could tell them apart.
+        RsbenchError: see ``load_solver``; or two of them have the same name.
     """
     entries: dict[str, SolverEntry] = {}
     given: dict[str, str] = {}
