@@ -42,12 +42,12 @@ def provenance(command: str, **inputs: Any) -> dict[str, Any]:
 
 
 def numeric_version() -> dict[str, str]:
-    """Versions that affect predictions beside components and data: our source and numerical packages."""
+    """Return the versions that affect predictions, apart from components and data: rsbench and its packages."""
     return {"source": own_source_version(), **{name: package_version(name) for name in _NUMERIC}}
 
 
 def commit() -> str:
-    """Commit of the checkout that this code lies in, with ``-dirty`` when a file differs from it; else empty.
+    """Return the commit of the checkout with this code, with ``-dirty`` if files differ; empty without a checkout.
 
     Changes of results and of README.md are ignored, because the run makes them.
     """

@@ -1,4 +1,4 @@
-"""Scores on recordings in layouts of others, as far as they have a truth: disparities, or poses of a camera."""
+"""Scores on recordings in the layouts of other projects, as far as these contain ground truth."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from rsbench.vision.stereo_matcher import MatcherEntry, find_disparities
 
 
 def depth_scores(recordings: Sequence[Recording], matcher: MatcherEntry) -> pd.DataFrame:
-    """A row for each pair of images with disparities of the left one, as in scores/depth.csv."""
+    """Score depth on each image pair with true disparities of the left image; columns as in scores/depth.csv."""
     rows: list[dict[str, Any]] = []
     for recording in recordings:
         for (side, frame), read in recording.disparities.items():
@@ -45,7 +45,7 @@ def depth_scores(recordings: Sequence[Recording], matcher: MatcherEntry) -> pd.D
             rig = StereoRig(camera=left, baseline=float(-apart.t[0]))
             images = eight_bit([read_frame(recording.images[view]) for view in pair])  # pyrefly: ignore
             found, _ = find_disparities(matcher, images[0], images[1], rig)
-            # A pixel's disparity lacks what the principal points differ by.
+            # ``StereoRig.depth`` assumes equal principal points, so their difference is added.
             estimate = np.nan_to_num(rig.depth(found.astype(np.float64) + (right.cx - left.cx)))
             truth = np.nan_to_num(rig.depth(read()))
             metrics = depth_metrics(estimate, truth, rig)
@@ -54,8 +54,8 @@ def depth_scores(recordings: Sequence[Recording], matcher: MatcherEntry) -> pd.D
 
 
 def pose_scores(recordings: Sequence[Recording], seed: int) -> pd.DataFrame:
-    """A row for every two successive frames of a camera whose shutter and poses are known, by rs-mono-refined, and
-    one of both cameras where they are a rig, by rs-stereo-refined."""
+    """Score the motion between successive frames: one row for each camera with known shutter and poses, solved by
+    rs-mono-refined, and one row for both cameras of a rig, solved by rs-stereo-refined."""
     rows: list[dict[str, Any]] = []
     for recording in recordings:
         rows += _rig_rows(recording, seed)
@@ -95,7 +95,7 @@ def _rig_rows(recording: Recording, seed: int) -> Iterator[dict[str, Any]]:
 
 
 def _relative(recording: Recording, side: Side, first: int, second: int) -> tuple[FloatArray, FloatArray] | None:
-    """Rotation vector and translation from the first frame to the second, of their first rows; None: not known."""
+    """Return the true rotation vector and translation between the first rows of two frames; None if unknown."""
     poses = recording.poses[side](np.array([first, second], dtype=np.float64))
     one, two = (Pose(poses.R[k], poses.t[k]) for k in (0, 1))
     moved = compose(two, inverse(one))
@@ -112,7 +112,7 @@ def _pose_score(
     reach = float(max(camera.width, camera.height))
     pairs = match(a, b, Gate(dx=(-reach, reach), dy=(-reach, reach)))
     matches = Correspondences(left=np.concatenate([a.points[pairs[:, 0]], b.points[pairs[:, 1]]], axis=1))
-    rig = StereoRig(camera=camera, baseline=1.0)  # a length that a solver of one camera does not ask for
+    rig = StereoRig(camera=camera, baseline=1.0)  # the baseline is not used
     solver = RefinedSolver(one_camera=True)
     shutter, rng = recording.shutters[side], np.random.default_rng(seed)
     found = estimate_motion(matches, rig, shutter, solver, RobustOptions(), rng)
@@ -120,7 +120,7 @@ def _pose_score(
 
 
 def _motion_score(found: RobustEstimate, w: FloatArray, d: FloatArray, matches: Correspondences) -> dict[str, Any]:
-    """Errors of an estimate; 180 degrees of one that failed."""
+    """Return the errors of an estimated motion; a failed estimate gets 180 degrees."""
     count = sum(len(getattr(matches, name)) for name in ("left", "right", "stereo_0", "stereo_1"))
     if not found.estimate.success:
         return {"e_R_deg": 180.0, "e_T_deg": 180.0, "inliers": 0, "matches": count}
@@ -138,7 +138,7 @@ Image = NDArray[Any]
 
 
 class Pair(NamedTuple):
-    """A frame whose truth is known, and the one before it."""
+    """A frame with ground truth, and the frame before it."""
 
     recording: Recording
     side: Side
@@ -147,14 +147,14 @@ class Pair(NamedTuple):
 
     @property
     def rows(self) -> list[int]:
-        """At whose times the truth of the frame is known."""
+        """Rows at whose times the true global-shutter image of the frame is available."""
         return sorted(
             row for side, frame, row in self.recording.truths if (side, frame) == (self.side, self.frame)
         )
 
 
 def pairs_with_truth(recordings: Sequence[Recording]) -> list[Pair]:
-    """Pairs of cameras whose shutter is known, in the order of recordings, cameras and frames."""
+    """Return the pairs of all cameras with a known shutter, in the order of recordings, cameras and frames."""
     found = list[Pair]()
     for recording in recordings:
         for side in recording.shutters:
@@ -165,7 +165,7 @@ def pairs_with_truth(recordings: Sequence[Recording]) -> list[Pair]:
 
 
 def check_sees_one_camera(entry: CorrectorEntry) -> None:
-    """Raises RsbenchError for a corrector that asks for more than the frames of one camera."""
+    """Raise RsbenchError if a corrector needs more than the frames of one camera."""
     spec = entry.component.spec
     needs = [*sorted(spec.needs), *(["the other camera"] if "stereo" in spec.sees else [])]
     if needs:
@@ -178,10 +178,10 @@ def check_sees_one_camera(entry: CorrectorEntry) -> None:
 def correction_scores(
     pairs: Sequence[Pair], correctors: Sequence[CorrectorEntry], step: Callable[[str], object] = str
 ) -> pd.DataFrame:
-    """A row for each pair, target and method; a frame that is not corrected counts as it was read.
+    """Score each corrector on each pair and target row; if a correction fails, the uncorrected frame is scored.
 
     Raises:
-        RsbenchError: an image that cannot be read, or that is not like the others of its pair.
+        RsbenchError: an image cannot be read, or differs in size or type from the others of its pair.
     """
     rows: list[dict[str, Any]] = []
     for pair in pairs:
@@ -200,7 +200,7 @@ def _scores(pair: Pair, correctors: Sequence[CorrectorEntry]) -> Iterator[dict[s
     weights = _weights(recording.masks.get((side, pair.frame)), image.shape[:2])
     problem = CorrectionProblem(
         images={("left", 0): before, _VIEW: image},
-        rig=StereoRig(camera=recording.cameras[side], baseline=1.0),  # of which one camera sees nothing
+        rig=StereoRig(camera=recording.cameras[side], baseline=1.0),  # the baseline is not used
         shutter=recording.shutters[side],
         target_row=float(rows[0]),
         motion=None,
@@ -238,7 +238,7 @@ def _compared(image: Image, true: Picture, weights: Image | None) -> dict[str, f
 
 
 def _weights(path: Path | None, shape: tuple[int, ...]) -> Image | None:
-    """(H, W) of a mask; RsbenchError where it has another size. None where there is none."""
+    """Return the weights (H, W) from a mask file, or None without one; RsbenchError if its size differs."""
     if path is None:
         return None
     mask = read_frame(path)

@@ -1,12 +1,12 @@
 """The contract of metrics, scores of predictions against the ground truth, and the rule for failures.
 
-A metric takes a prediction beside the truth and returns columns of a table; a card or an entry point names it.
-It is a class below ``PoseMetric``, ``DepthMetric`` or ``ImageMetric``, which says what it reads. It scores
-predictions only; what a failed prediction scores, its columns say and ``score`` applies.
+A metric compares a prediction with the ground truth and returns columns of a table; a card or an entry point names
+it. It is a subclass of ``PoseMetric``, ``DepthMetric`` or ``ImageMetric``, which defines its input. A metric only
+scores successful predictions: ``score`` gives a failed one the ``worst`` value of each column.
 
-Simulated trials, image sequences and the studies all use it. A failure is a prediction that says so, that is
-not finite, or that is not there: it scores the worst value of everything, is counted, and is never replaced by "no
-motion".
+Simulated trials, image sequences and the studies all use these rules. A prediction is a failure if it is marked as
+failed, not finite, or missing. A failure gets the worst value of every score and is counted; it is never replaced
+by "no motion".
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ from rsbench.core.so3 import FloatArray
 @final
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One number that a metric computes. Raises ValueError on a name or direction that cannot be."""
+    """A number that a metric computes. Raises ValueError if a name, a direction or a worst value is invalid."""
 
     name: str
     """Name in score files: letters, digits and _, such as ``e_R_deg``."""
     better: Literal["lower", "higher"]
     worst: float
-    """What a failed prediction scores; may be infinite."""
+    """Score of a failed prediction; may be infinite."""
     unit: str = ""
-    """Such as ``deg``; empty for a number without one."""
+    """Unit, such as ``deg``; empty for a dimensionless number."""
     title: str = ""
-    """Heading in tables for people; the name when empty."""
+    """Heading in printed tables; if empty, the name is used."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z]\w*", self.name, flags=re.ASCII):
@@ -72,7 +72,7 @@ class Column:
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseCase:
-    """An estimated motion over one frame period beside the true one."""
+    """An estimated motion over one frame period and the true motion."""
 
     w: FloatArray
     """(3,) estimated rotation vector, rad."""
@@ -91,45 +91,45 @@ class PoseCase:
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DepthCase:
-    """An estimated depth map beside the true one."""
+    """An estimated depth map and the true one."""
 
     depth: NDArray[np.float32]
-    """(H, W) z in the row's own camera, m; 0 unknown."""
+    """(H, W) estimated z in the camera at the pose of the pixel's row, m; 0 where unknown."""
     truth: NDArray[np.float32]
-    """(H, W) the same, exact; 0 where there is no surface."""
+    """(H, W) true z, m; 0 where there is no surface."""
     pixels: NDArray[np.bool_]
-    """(H, W) those that count."""
+    """(H, W) mask of the pixels that are scored."""
     rig: StereoRig
 
 
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageCase:
-    """A corrected frame beside the global-shutter image."""
+    """A corrected frame and the true global-shutter image."""
 
     image: NDArray[np.uint8]
     """(H, W, 3) sRGB; black where nothing was drawn."""
     truth: NDArray[np.uint8]
     pixels: NDArray[np.bool_]
-    """(H, W) those that count."""
+    """(H, W) mask of the pixels that are scored."""
 
 
 Case = PoseCase | DepthCase | ImageCase
 
 
 class Metric(ABC):
-    """What all metrics share; derive from one of the three below."""
+    """Base class of all metrics; derive from one of the three subclasses below."""
 
     case: type[Case]
 
     @property
     @abstractmethod
     def columns(self) -> tuple[Column, ...]:
-        """What it computes; a class attribute where the parameters do not change it."""
+        """Columns that the metric computes; a class attribute if they do not depend on parameters."""
 
     @abstractmethod
     def compute(self, case: Any) -> Mapping[str, float]:
-        """A value for each column, by its name; NaN where the truth leaves nothing to score."""
+        """Return a value for each column, by its name; NaN if the ground truth has nothing to score."""
 
 
 class PoseMetric(Metric):
@@ -169,10 +169,10 @@ METRICS: Kind[Metric, RunOptions] = Kind(
 
 
 def load_metrics(names_or_paths: Iterable[str | Path]) -> tuple[MetricEntry, ...]:
-    """Metrics by the name of a card or entry point, or by the path of a card.
+    """Load metrics by the name of a card or entry point, or by the path of a card.
 
     Raises:
-        RsbenchError: no such metric; one whose class or columns are wrong; two with one column.
+        RsbenchError: a metric does not exist, has an invalid class or columns, or shares a column with another.
     """
     entries = tuple(plugins.load_entry(METRICS, name) for name in names_or_paths)
     owners: dict[tuple[type[Case], str], MetricEntry] = {}
@@ -190,7 +190,7 @@ def load_metrics(names_or_paths: Iterable[str | Path]) -> tuple[MetricEntry, ...
 
 
 def _columns(entry: MetricEntry) -> tuple[Column, ...]:
-    """Its columns, checked: they are read in this process."""
+    """Return the checked columns of a metric, which are read in this process."""
     try:
         columns = entry.component.columns
     except Exception as error:
@@ -207,8 +207,8 @@ WORST_POSE = {"e_R_deg": 180.0, "e_T_deg": 180.0, "e_s": WORST_SCALE}
 
 
 def answered(w: ArrayLike, d: ArrayLike, success: ArrayLike = True) -> NDArray[np.bool_]:
-    """Whether estimates (..., 3), (..., 3) are answers: marked as successful (...), finite, and with a ``w`` whose
-    square does not overflow."""
+    """Return whether estimates (..., 3), (..., 3) are valid: marked as successful (...), finite, and with a ``w``
+    whose square does not overflow."""
     finite = np.all(np.abs(w) <= LARGEST, axis=-1) & np.all(np.isfinite(d), axis=-1)
     return np.asarray(success, dtype=np.bool_) & finite
 
@@ -224,30 +224,30 @@ def pose_errors(
     metric: ArrayLike = True,
     reference_point: str = "body",
 ) -> dict[str, FloatArray]:
-    """Errors (...) of estimated motions, as docs/explanation/conventions.md defines them; all arguments broadcast.
+    """Compute errors (...) of motions as defined in docs/explanation/conventions.md; all arguments broadcast.
 
     Args:
-        w, d: (..., 3) estimated motion over one frame period, rad and m (or any length where not ``metric``).
+        w, d: (..., 3) estimated motion over one frame period, rad and m (or an unknown unit if not ``metric``).
         true_w, true_d: (..., 3) true motion of the body, rad and m.
-        rig: rig whose left camera is meant by ``reference_point = "left"``.
+        rig: rig that contains the left camera of ``reference_point = "left"``.
         success: (...) whether the estimates are marked as successful; see ``answered``.
         metric: (...) whether the length of ``d`` is in metres.
-        reference_point: ``body`` or ``left``, the point whose translation ``d`` is; the truth is moved there.
+        reference_point: ``body`` or ``left``, the point whose translation is ``d``; the truth is converted to it.
 
     Returns:
-        ``e_R_deg`` and ``e_T_deg`` (degrees) and ``e_s``. A failure scores 180, 180 and infinity. NaN where an
-        error does not exist for any method: e_T where the true translation is zero; and for an estimate that
-        did not fail, e_s where that is so or no metres are claimed.
+        ``e_R_deg`` and ``e_T_deg`` (degrees) and ``e_s``. A failure scores 180, 180 and infinity. If the true
+        translation is zero, e_T is NaN for every method, and e_s is NaN for a successful estimate; e_s is also
+        NaN for a successful estimate that is not ``metric``.
 
     Raises:
-        ValueError: no such reference point.
+        ValueError: the reference point is unknown.
     """
     if reference_point not in ("body", "left"):
         raise ValueError(f"reference_point = {reference_point!r}: must be 'body' or 'left'")
     if reference_point == "left":
         true_d = translation_of_offset(true_w, true_d, rig.offset("left"))
     good = answered(w, d, success)
-    # Failures hold NaN, which no formula may meet: no warning, no NaN that would vanish from a median.
+    # Failures may contain NaN; zeros avoid warnings in the formulas, and NaN that medians would later ignore.
     w, d = (np.where(good[..., None], value, 0.0) for value in (w, d))
     exists = np.any(np.asarray(true_d) != 0.0, axis=-1)
     e_R = np.where(good, rotation_error(w, true_w), WORST_ANGLE)
@@ -258,7 +258,7 @@ def pose_errors(
 
 
 def motion_errors(motion: Motion | None, truth: Motion, rig: StereoRig) -> dict[str, float]:
-    """e_R_deg and e_T_deg of an estimated motion of the body; None is a failure, which scores the worst values."""
+    """Return e_R_deg and e_T_deg of an estimated motion of the body; None, a failure, gets the worst scores."""
     nothing = np.full(3, np.nan)
     w, d = (nothing, nothing) if motion is None else (motion.w, motion.d)
     errors = pose_errors(w, d, true_w=truth.w, true_d=truth.d, rig=rig)
@@ -266,10 +266,10 @@ def motion_errors(motion: Motion | None, truth: Motion, rig: StereoRig) -> dict[
 
 
 def score(metric: MetricEntry, case: Case | None) -> dict[str, float]:
-    """The columns of a metric for a prediction, or what a failed one (None) scores in them.
+    """Return the columns of a metric for a prediction; a failed prediction (None) gets the worst values.
 
     Raises:
-        RsbenchError: another package's metric raised or answered something else: one line with its name.
+        RsbenchError: another package's metric raised an exception or returned invalid values; names the metric.
     """
     columns = metric.component.columns
     if case is None:

@@ -1,9 +1,8 @@
-"""Confidence intervals: order statistics for few values, a cluster bootstrap for many.
+"""Confidence intervals: order statistics for small samples, a cluster bootstrap for large ones.
 
-With few values a percentile bootstrap of the median is too narrow: it never leaves the values drawn. The order
-statistics of independent values bracket the median of what they were drawn from with a probability that the
-binomial distribution gives exactly, whatever that distribution is. Values that share a scene are not independent;
-a bootstrap then draws whole scenes.
+A percentile bootstrap of the median is too narrow for small samples. Two order statistics of independent values
+enclose the median of any continuous distribution with a probability that follows exactly from the binomial
+distribution. Values from the same scene are not independent; the bootstrap then resamples whole scenes.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ from rsbench.core.so3 import FloatArray
 
 COVERAGE = 0.95
 FEW = 30
-"""Below this many values the interval of a median is that of order statistics."""
+"""Sample size below which the interval of a median is computed from order statistics."""
 RESAMPLES = 10_000
 _CHUNK = 2_000_000
-"""Numbers drawn at a time."""
+"""Number of values that are drawn at once, which limits the memory."""
 Statistic = Callable[[FloatArray], FloatArray]
-"""Reduces the axis of values of resampled values (resamples, values, ...)."""
+"""Function that reduces the second axis of resampled values (resamples, values, ...)."""
 
 
 class Interval(NamedTuple):
@@ -38,10 +37,10 @@ class Interval(NamedTuple):
 
 
 def median_interval(values: ArrayLike) -> Interval:
-    """Exact interval of the median of the distribution of independent values (n,).
+    """Return the exact interval of the median of the distribution of independent values (n,).
 
-    The ends are order statistics x[k], x[n + 1 - k] with the largest k that still holds with ``COVERAGE``; with
-    fewer than six values no such k exists at 95 % and the interval is infinite. Nine values: x[2], x[8].
+    The ends are the order statistics x[k] and x[n + 1 - k] with the largest k for which the probability is at
+    least ``COVERAGE``. At 95 %, nine values give x[2] and x[8]; fewer than six give an infinite interval.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     n = len(ordered)
@@ -55,7 +54,7 @@ def median_interval(values: ArrayLike) -> Interval:
 
 
 def share_interval(successes: int, trials: int, coverage: float = COVERAGE) -> Interval:
-    """Exact (Clopper-Pearson) interval of a share: 300 of 300 is [0.988, 1], not [1, 1]."""
+    """Return the exact (Clopper-Pearson) interval of a share; for 300 of 300 it is [0.988, 1]."""
     if trials == 0:
         return Interval(0.0, 1.0)
     tail, failures = 0.5 * (1.0 - coverage), trials - successes
@@ -65,7 +64,7 @@ def share_interval(successes: int, trials: int, coverage: float = COVERAGE) -> I
 
 
 def scene_means(values: FloatArray, scenes: Sequence[str]) -> FloatArray:
-    """Means (..., scenes), in the order of their names, of values (..., n)."""
+    """Return the means (..., scenes) of values (..., n) over each scene, in the order of the scene names."""
     names, labels = np.unique(np.asarray(scenes), return_inverse=True)
     weights = np.zeros((len(names), len(labels)))
     weights[labels, np.arange(len(labels))] = 1.0
@@ -73,7 +72,7 @@ def scene_means(values: FloatArray, scenes: Sequence[str]) -> FloatArray:
 
 
 def mean_interval(means: FloatArray) -> Interval:
-    """Student's interval of the mean of independent scene means (k,); infinite for a single scene."""
+    """Return Student's t interval of the mean of independent scene means (k,); infinite for a single scene."""
     k = len(means)
     if k < 2:
         return Interval(-np.inf, np.inf)
@@ -83,11 +82,11 @@ def mean_interval(means: FloatArray) -> Interval:
 
 
 def score_interval(values: FloatArray, scenes: Sequence[str], share: bool = True) -> tuple[float, float, float]:
-    """The mean over scenes of values (n,), and the ends of its interval.
+    """Return the mean over scenes of values (n,) and the ends of its interval.
 
-    A ``share`` and its interval lie in [0, 1]. For values 0 and 1 of independent problems the interval is the
-    exact binomial one. If problems share scenes, the interval contains the exact one, so that it does not shrink
-    to a point when all values are equal.
+    A ``share`` and its interval lie in [0, 1]. If all values are 0 or 1 and each problem has its own scene, the
+    interval is the exact binomial one. If problems share scenes, Student's interval is extended to contain the
+    exact one, so that it does not shrink to a point if all values are equal.
     """
     means = scene_means(values, scenes)
     low, high = mean_interval(means)
@@ -108,15 +107,15 @@ def bootstrap_interval(
     clusters: Sequence[Any] | NDArray[Any] | None = None,
     resamples: int = RESAMPLES,
 ) -> Interval:
-    """Percentile interval of a statistic of values (n, ...).
+    """Compute the percentile bootstrap interval of a statistic of values (n, ...).
 
     Args:
         values: n values, each a number or an array.
         statistic: see ``Statistic``.
-        seed: all calls with the same n, clusters and seed draw the same values, so that entries are compared on
-            common draws.
-        clusters: (n,) labels; whole clusters are drawn. Clusters of unequal size give samples of unequal size.
-        resamples: how many samples.
+        seed: calls with the same n, clusters and seed use the same resamples, so that entries are compared on
+            common resamples.
+        clusters: (n,) labels; whole clusters are resampled. Unequal clusters give resamples of unequal size.
+        resamples: number of resamples.
     """
     rng = generator(seed, "bootstrap", len(values))
     if clusters is None:
@@ -149,7 +148,7 @@ def _clustered(
 
 
 def _medians(values: FloatArray, labels: NDArray[np.intp], draws: NDArray[np.int64]) -> FloatArray:
-    """Medians (resamples,) of the values (n,) in the clusters of each draw (resamples, clusters)."""
+    """Return the medians (resamples,) of the values (n,) in the resampled clusters (resamples, clusters)."""
     order = np.argsort(values, kind="stable")
     times = np.sum(draws[:, :, None] == np.arange(draws.shape[1]), axis=1)
     below = np.cumsum(times[:, labels[order]], axis=1)
@@ -158,18 +157,18 @@ def _medians(values: FloatArray, labels: NDArray[np.intp], draws: NDArray[np.int
 
 
 def typical_interval(values: FloatArray, seed: int, clusters: Sequence[Any] | None = None) -> Interval:
-    """Interval of the median of values (n,): exact for few, a bootstrap of clusters for many."""
+    """Return the interval of the median of values (n,): exact below ``FEW`` values, otherwise a bootstrap."""
     if len(values) < FEW:
         return median_interval(values)
     if clusters is not None:
         return bootstrap_interval(values, median, seed, clusters)
-    # The median of a sample is the value at the median of its ranks, which are the same for all values.
+    # The median of a resample is the value at its median rank; the ranks do not depend on the values.
     middle = _middle_ranks(len(values), seed)
     return _middle_part(np.mean(np.sort(values)[middle], axis=1))
 
 
 def average_interval(values: FloatArray, seed: int, of: Statistic | None = None) -> Interval:
-    """Bootstrap interval of the mean of independent values (n,), or of a function ``of`` the means of (n, k).
+    """Return the bootstrap interval of the mean of values (n,), or of a function ``of`` the means of (n, k).
 
     ``of`` reduces the last axis of means (resamples, k).
     """
@@ -179,25 +178,25 @@ def average_interval(values: FloatArray, seed: int, of: Statistic | None = None)
 
 @lru_cache(maxsize=4)
 def _counts(n: int, seed: int) -> FloatArray:
-    """How often each of n values is in each sample (resamples, n)."""
+    """Return how often each of n values occurs in each resample, (resamples, n)."""
     return generator(seed, "bootstrap", n).multinomial(n, np.full(n, 1.0 / n), RESAMPLES).astype(np.float64)
 
 
 @lru_cache(maxsize=4)
 def _middle_ranks(n: int, seed: int) -> NDArray[np.intp]:
-    """Ranks (resamples, 2), counted from 0, of the one or two middle values of n values drawn from n."""
+    """Return the ranks (resamples, 2), from 0, of the one or two middle values of each resample."""
     drawn = np.cumsum(_counts(n, seed), axis=1)
     return np.stack([np.argmax(drawn > k, axis=1) for k in ((n - 1) // 2, n // 2)], axis=1)
 
 
 def _middle_part(drawn: FloatArray) -> Interval:
     tail = 0.5 * (1.0 - COVERAGE)
-    low, high = np.quantile(drawn, [tail, 1.0 - tail], method="inverted_cdf")  # between infinities lies nothing
+    low, high = np.quantile(drawn, [tail, 1.0 - tail], method="inverted_cdf")  # no NaN between infinities
     return Interval(float(low), float(high))
 
 
 def format_interval(value: float, low: float, high: float) -> str:
-    """``value [low, high]`` with the digits that the interval leaves: the last is below a third of half of it."""
+    """Format ``value [low, high]``; the last digit is at most a third of the half-width of the interval."""
     if low == high or not all(map(math.isfinite, (value, low, high))):
         return f"{value:.3g} [{low:.3g}, {high:.3g}]"
     digits = decimals(low, high)
@@ -205,23 +204,23 @@ def format_interval(value: float, low: float, high: float) -> str:
 
 
 def with_ends(name: str, value: Any, low: Any, high: Any) -> dict[str, Any]:
-    """A number and the ends of its interval as columns of a table."""
+    """Return a value and the ends of its interval as columns of a table."""
     return {name: value, f"{name}_low": low, f"{name}_high": high}
 
 
 def decimals(low: float, high: float) -> int:
-    """Decimals that an interval leaves to its value; negative: tens, hundreds. At most 9."""
+    """Return the number of significant decimals for an interval, at most 9; negative for tens and hundreds."""
     half = 0.5 * (high - low)
     return 9 if half <= 0.0 else min(9, -math.floor(math.log10(half / 3.0)))
 
 
 def rounded(value: float, digits: int) -> str:
-    """A number with so many decimals, zeros kept; tens and hundreds for negative ones."""
+    """Format a number with ``digits`` decimals and trailing zeros; negative: rounded to tens or hundreds."""
     return f"{round(value, digits):.{max(digits, 0)}f}"
 
 
 def median_and_quartiles(values: ArrayLike) -> str:
-    """``median [lower, upper]`` with digits that fit their distance, at most three; one number if they agree.
+    """Format ``median [lower, upper]`` with digits that suit the quartile range; one number if all are equal.
 
     NaN is left out. The quartiles are elements of ``values``, because a finite and an infinite value cannot be
     interpolated.
@@ -242,7 +241,7 @@ def median_and_quartiles(values: ArrayLike) -> str:
 
 
 def _exponent(value: float) -> int:
-    """Decimal exponent of the first significant digit: 0 for ones, -1 for tenths."""
+    """Return the decimal exponent of the first significant digit: 0 for ones, -1 for tenths."""
     return math.floor(math.log10(abs(value))) if value else 0
 
 

@@ -132,7 +132,7 @@ def parts() -> list[Callable[[], object]]:
     known = KnownInputs(readout_ratio=shutter.readout_ratio)
     few = SimulationOptions(pairs=80, tracks=80, noise_px=0.1)
     shaken = SplineMotion([0.03, 0.05, 0.0], [0.1, 0.0, 0.2], preset="handheld")
-    # Two laws, and shakes that need a spline.
+    # Two motion models, and a shake that needs a spline.
     straight, turning, shaking = (
         simulate(rig, shutter, each, few, np.random.default_rng(0)).correspondences
         for each in (motion, InertialMotion([0.05, 0.12, 0.05], [0.1, 0.0, 0.2]), shaken)

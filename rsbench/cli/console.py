@@ -85,7 +85,7 @@ def print_answers(
 def _progress(
     before: tuple[ProgressColumn, ...] = (), after: tuple[ProgressColumn, ...] = (), **options: Any
 ) -> Progress:
-    """A count of steps, with columns before and after it; no markup, since names of files may have brackets."""
+    """Create a counter of steps with columns before and after it; brackets in names are not read as markup."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -210,7 +210,7 @@ def _keys(rows: Sequence[Sequence[str]]) -> int:
 
 
 def _blocks(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
-    """Columns of the parts of a table, each with the key columns; one part where a word would not fit."""
+    """Split columns into parts that fit, each with the key columns; a single part if a word would not fit."""
     room -= sum(widths[:keys]) + _GAP * keys + 1
     blocks: list[list[int]] = [[]]
     for k in range(keys, len(widths)):
@@ -223,7 +223,7 @@ def _blocks(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
 
 
 def _shared(least: Sequence[int], most: Sequence[int], room: int) -> Sequence[int | None]:
-    """Widths of columns, which share the room beyond their longest words; None where these do not fit."""
+    """Widths of columns: their longest words, and shares of the remaining room; None if the words do not fit."""
     spare = room - sum(least)
     if spare < 0:
         return [None] * len(least)

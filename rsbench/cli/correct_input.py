@@ -1,6 +1,6 @@
 """The input of ``rsbench correct``: frames of a rig, its card, a gyroscope's log and the target row.
 
-Functions import what only they need, so that a wrong command line is refused at once.
+Slow imports are inside functions, so that a wrong command line is refused at once.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class Arranged:
     frames: list[Path] | None
     """Images, or the folder of a rendered sequence."""
     left: Path | None
-    """Folder or video; of one camera its own."""
+    """Folder or video of the left camera, or of the only one."""
     right: Path | None
     words: str = ""
     """The assumption, and the option that changes it; empty if there is none."""

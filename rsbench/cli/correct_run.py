@@ -1,4 +1,4 @@
-"""``rsbench correct`` of four frames, or of a sequence: a killed run goes on after the frames that it wrote."""
+"""Run ``rsbench correct`` on four frames or a sequence; an interrupted run resumes after the frames it wrote."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def alone_of(frames: Mapping[Any, Fused]) -> dict[str, Any]:
 
 
 def _say_alone(alone: Mapping[Any, Mapping[str, Any]]) -> None:
-    """Name the frames (number or view) that the motion of the rig does not explain."""
+    """Print which frames (number or view) were corrected by each camera alone."""
     if not alone:
         return
     least = min(each["explained"] for each in alone.values())
@@ -141,7 +141,7 @@ def _say_alone(alone: Mapping[Any, Mapping[str, Any]]) -> None:
 
 
 _PAGE_FRAMES, _AHEAD = 6, 4
-"""Frames on the page; frames that are read while others are encoded."""
+"""Number of frames on the page; number of frames that are read ahead while others are encoded."""
 
 
 def correct_given(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
@@ -180,7 +180,7 @@ def _correct_four(given: CorrectInput, target: str, options: CorrectionOptions, 
         known, rig = result.known, result.rig
 
         def written(view: View) -> tuple[Fused, dict[str, Any]]:
-            """The frame as written, and its card on the page."""
+            """Write a corrected frame; return it with its entry on the page."""
             fused, name = finished(result.frames[view]) if close else result.frames[view], "{}_{}".format(*view)
             results.write_frame(folder, name, fused)
             if given.rectify:
@@ -219,7 +219,7 @@ def _say_four(out: Path, first: str, record: dict[str, Any]) -> None:
 
 
 def _correct_sequence(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
-    """Exit 1 where a time is not corrected; ``close``: narrow holes of corrected frames."""
+    """Correct a sequence; exit code 1 if any frame time is not corrected. ``close``: close narrow holes."""
     sources, card, out, lines = given.sources(), given.card, given.out, list[str]()
     if given.rectify and given.video:
         raise RsbenchError(f"--rectify: --out {out} is a video; give a folder, for pairs with their calibration")
@@ -256,7 +256,7 @@ def _correct_sequence(given: CorrectInput, target: str, options: CorrectionOptio
 def _say_input(
     given: CorrectInput, source: FrameSource, shape: tuple[int, ...], options: CorrectionOptions
 ) -> None:
-    """What was assumed of one camera's frames, a line each."""
+    """Print the assumptions about one camera's frames, a line each."""
     (height, width), timeline = shape[:2], source.timeline
     if given.words:
         echo(given.words)
@@ -275,7 +275,7 @@ def _say_input(
 
 
 def _warn_of_times(sources: list[FrameSource]) -> None:
-    """Name a rig's videos whose frames repeat others or come at other times: they are taken as they come."""
+    """Warn if a video of a rig has repeated or unevenly spaced frames, which are treated as evenly spaced."""
     for side, source in zip(SIDES, sources, strict=True):
         if source.video is None:
             continue
@@ -296,7 +296,7 @@ def _run_key(
     close: bool,
     gyro: Gyroscope | None,
 ) -> str:
-    """Hash of all that decides what is written: a run with another key does not resume this one."""
+    """Return a hash of all inputs that affect the results; only a run with the same key resumes this one."""
     flags = close, given.row_poses, given.video, given.rectify
     parts = [__version__, repr(given.card), repr(options), repr(flags)]
     parts += [each for source in sources for each in source.identity()]
@@ -312,9 +312,9 @@ def _correct_into(
     close: bool,
     given: CorrectInput,
 ) -> list[dict[str, Any]]:
-    """Write every frame that is not there yet; returns what motion.json says of each.
+    """Write every frame that does not exist yet; returns the entries of all frames in motion.json.
 
-    The matches of frames that are there are found again: the trajectory of the others rests on them.
+    Existing frames are matched again, as the trajectory of the others depends on their matches.
     """
     entries = results.written_entries(folder)
     twins = sources[0].timeline.twins.tolist() if given.one_camera else []
@@ -343,7 +343,7 @@ def _correct_into(
 def _write(
     folder: Path, moment: CorrectedMoment, close: bool, given: CorrectInput, known: KnownCapture, orientation: int
 ) -> dict[str, Any]:
-    """Write a corrected time, and then its record: a time with a record is complete."""
+    """Write the images of a frame time, then its record, which marks them as complete; returns the record."""
     entry: dict[str, Any] = {"number": moment.number}
     how: dict[str, Any] = {"whole": not given.video, "orientation": orientation}
     for side, fused in (moment.shown if given.one_camera else moment.frames).items():
@@ -374,7 +374,8 @@ def _name(side: str, number: int, one_camera: bool) -> str:
 def _write_page(
     folder: Path, given: CorrectInput, source: FrameSource, record: dict[str, Any], known: KnownCapture
 ) -> list[Path]:
-    """The page, of the frames of the left or only camera that changed most; beside a video, one to compare."""
+    """Write the page with the most changed frames of the left or only camera. For ``--out`` a video, also write a
+    video that compares frames before and after, and return both files."""
     one, out, changed, frames = given.one_camera, given.out, list[float](), record["frames"]
     numbers = [each["number"] for each in frames if one or "left" in each]
     names = [_name("left", number, one) for number in numbers]
@@ -416,12 +417,12 @@ def _write_page(
 def _write_video(
     given: CorrectInput, folder: Path, sources: list[FrameSource], record: dict[str, Any], others: list[Path]
 ) -> list[str]:
-    """A video, of a rig with both cameras side by side; a time that is not corrected is there as it was read.
+    """Write a video, for a rig with both cameras side by side; frames that were not corrected are kept as read.
 
-    Returns notes on what was written.
+    Returns notes about the written video.
     """
     one, first = given.one_camera, sources[0]
-    turn = UPRIGHT if one else first.orientation  # of both, so that they stay side by side
+    turn = UPRIGHT if one else first.orientation  # applied to both images, so that they stay side by side
 
     def shown(side: str, number: int, image: Any) -> Any:
         name = _name(side, number, one)
@@ -437,7 +438,7 @@ def _write_video(
 
 
 def _say(given: CorrectInput, known: KnownCapture, record: dict[str, Any], lines: list[str]) -> None:
-    """Exit 1 where a time is not corrected; ``lines``: notes on what was written."""
+    """Print a summary, with ``lines`` on what was written; exit code 1 if a frame time was not corrected."""
     frames, one = record["frames"], given.one_camera
     failed, skipped = (
         listed((frame["number"], frame[key]) for frame in frames if key in frame) for key in ("reason", "skipped")
@@ -459,7 +460,7 @@ def _say(given: CorrectInput, known: KnownCapture, record: dict[str, Any], lines
     used = [found for _, found in gyros if not isinstance(found, str)]
     if used:
         off = max(abs(value - (i == j)) for i, row in enumerate(used[-1]["matrix"]) for j, value in enumerate(row))
-        shift = used[-1]["shift"]  # above 0 its times are early
+        shift = used[-1]["shift"]  # positive: its times are early
         clock = f"{abs(shift):.3f} frame periods {'behind' if shift > 0.0 else 'ahead'}"
         echo(f"gyroscope: clock {clock}, axes and scales off by {off:.1%}: corrected for")
     elif known.gyro is not None and not one and record["readout_ratio"] == 0.0:

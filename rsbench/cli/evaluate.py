@@ -110,7 +110,8 @@ def evaluate(
 
 
 def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, corrector: str, seed: int) -> None:
-    """Depth of pairs with disparities, motion of one camera with poses, its frames with their truth: tables."""
+    """Evaluate a dataset in another layout and write tables: depth of pairs with disparities, motion of one camera
+    with poses, and correction of its frames with global-shutter images."""
     from rsbench.benchmark.recordings import depth_scores, pose_scores
     from rsbench.interop.readers.layouts import read_others
     from rsbench.storage.files import check_out, write_table
@@ -140,7 +141,7 @@ def _evaluate_others(folder: Path, out: Path, layout: str, matcher: str, correct
 
 
 def _correction_scores(recordings: Sequence[Recording], corrector: str) -> pd.DataFrame:
-    """Scores of two correctors of one camera: scaled flow, and ``corrector`` or, if that is the default, ours."""
+    """Score two correctors of one camera: flow-scaled, and ``corrector`` or, if it is the default, mono-fusion."""
     from rsbench.benchmark.recordings import check_sees_one_camera, correction_scores, pairs_with_truth
     from rsbench.vision.corrector import load_corrector
 
@@ -169,7 +170,7 @@ _ON_REQUEST = (
     *("gs-p3p", "gs-stereo-triplets", "gs-stereo-triplets-lines", "rs-r6p", "rs-r6p-single"),
     *("gs-upright-3pt", "gs-upright-4pt", "rs-gyro-5pt", "rs-gyro-stereo"),  # need a sensor
 )
-"""Solvers that run only when they are named: they would double the time; boards of images have most."""
+"""Solvers that run only if they are named, as they would double the time; boards on images have most of them."""
 
 
 def every_solver() -> list[str]:

@@ -110,7 +110,7 @@ def _watched() -> Iterator[None]:
 
 
 def _watch(reader: int, done: threading.Event) -> None:
-    """End the process if the main thread has not after ``_PATIENCE_S``."""
+    """End the process ``_PATIENCE_S`` after a signal, unless ``done`` is set before."""
     with open(reader, "rb", buffering=0) as stream:
         while byte := stream.read(1):
             if byte[0] in _SIGNALS and not done.wait(_PATIENCE_S):

@@ -160,7 +160,7 @@ def generate(
 
 
 def _split(card: str, name: str, place: Path | str, changed: bool, count: int | None) -> DatasetCard:
-    """A split of a card, with the cards of its scenes beside the dataset."""
+    """Draw a split of a card, and write the cards of its scenes beside the dataset."""
     from rsbench.dataset.secret_split import open_split, secret_card, write_scenes
     from rsbench.storage.untrusted_files import NAME
 
@@ -179,7 +179,7 @@ def _split(card: str, name: str, place: Path | str, changed: bool, count: int | 
 def _chosen(
     dataset: DatasetCard, sequence: list[str] | None, shard: str | None, channels: str | None
 ) -> DatasetCard:
-    """What the options leave of a card."""
+    """Restrict a dataset to the sequences and channels that the options select."""
     from rsbench.dataset.channels import named_channels
 
     if sequence:
@@ -193,7 +193,7 @@ def _chosen(
 
 
 def _estimated(dataset: DatasetCard, full_frames: bool) -> str:
-    """What it will take, in one line."""
+    """Return one line with the estimated files, size and time."""
     from rsbench.dataset.generation import estimate_dataset
 
     if full_frames:

@@ -1,4 +1,4 @@
-"""What ``rsbench inspect`` runs: rigs of problems, frames and datasets, and what was estimated of each."""
+"""Run ``rsbench inspect``: estimate the shutter for the rigs of problems, frames and datasets."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class InspectOptions:
     features: str
     seed: int
     readout: ReadoutOptions
-    """What is printed beside the estimate, in place of what a calibration says."""
+    """The readout given by options, to be printed beside the estimate; it replaces that of the calibration."""
     max_sigma: float
 
     @property
@@ -48,7 +48,7 @@ class InspectOptions:
 
 
 Found = Iterator[dict[str, Any] | RsbenchError]
-"""An answer for each rig, or the error that its input is."""
+"""For each rig the answer, or the error if its input is wrong."""
 
 
 def inspections(
@@ -80,7 +80,8 @@ def _of_problems(path: Path, options: InspectOptions) -> Found:
 
 
 def _of_frames(left: FrameSource, right: FrameSource, card: Path, options: InspectOptions) -> dict[str, Any]:
-    """Frames of a user, whose card says the rig; what was found of a camera that it is not sure of: on stderr."""
+    """Inspect a user's frames, whose card describes the rig. Uncertain intrinsics are estimated, and printed on
+    stderr."""
     first, second = next(iter(left)), next(iter(right))
     readout = options.readout.beside(card, False, left.path)
     given, notes = read_rig_file(card, readout, lambda: (first.shape[1], first.shape[0]))
@@ -112,8 +113,8 @@ def _of_windows(
     shutter: RollingShutter | None,
     options: InspectOptions,
 ) -> dict[str, Any]:
-    """From windows of successive frames, evenly over the sequence."""
-    unknown = Scanning(scan="left")  # as where columns are read: partners may lie on any row
+    """Inspect a rig by windows of two successive frames, evenly spaced in the sequence."""
+    unknown = Scanning(scan="left")  # as for columns: matches may be on any rows
     every, windows = max((left.count - 1) // options.windows, 1), list[Window]()
     with Isolation() as isolation:
         chain = isolation.chain(options.chain)
@@ -132,7 +133,7 @@ def _of_windows(
 
 
 def _record(name: str, found: Capture, given: RollingShutter | None) -> dict[str, Any]:
-    """The JSON answer for one rig; what is not determined is null."""
+    """Return the JSON answer for one rig; undetermined values are null."""
     named, best = (found.likeliest if known else None for known in (found.named, found.determined))
     said = None
     if given is not None:

@@ -1,4 +1,4 @@
-"""``rsbench leaderboard``: methods of anybody on the same problems, ranked as far as the data decide."""
+"""``rsbench leaderboard``: compare methods of anybody on the same problems, ranked as far as the data allow."""
 
 from __future__ import annotations
 
@@ -269,7 +269,7 @@ def run(
 
 
 def _stored(whole: Split, split: Split, folder: Path | None) -> list[Scored]:
-    """Entries from stored predictions, of a folder or else those that come with rsbench, on a part of a split."""
+    """Score stored predictions, of ``folder`` or else those installed with rsbench, on a part of a split."""
     from rsbench.benchmark.leaderboard.board import restore
     from rsbench.components.cards import shipped_folder
 
@@ -280,7 +280,7 @@ def _stored(whole: Split, split: Split, folder: Path | None) -> list[Scored]:
             with tempfile.TemporaryDirectory() as board:
                 try:
                     found += restore(each, whole, Path(board), split, step)
-                except RsbenchError:  # of another split
+                except RsbenchError:  # predictions for another split
                     if folder is not None:
                         raise
     return found
@@ -541,8 +541,8 @@ def _echo_doubt(scored: Scored) -> None:
 
 
 def _scoring(split: Split) -> AbstractContextManager[Callable[[str], None]]:
-    """A bar of the problems whose pictures are scored."""
-    if not split.track.pictures:  # the rest takes no time
+    """Progress bar of the problems whose pictures are scored; none for tracks without pictures."""
+    if not split.track.pictures:  # other scores take no time
         return nullcontext(lambda word: None)
     return progress_bar(f"scoring {split.name}", len(split.truths))
 
@@ -572,9 +572,10 @@ def _show(
     csv: bool = False,
     beside: Sequence[Scored] = (),
 ) -> None:
-    """Print a table; of one method, its line alone.
+    """Print a table; for a given method, only its line.
 
-    Of ``beside`` those are in it whose name the board has not and with which an entry of the board is compared.
+    Entries of ``beside`` are added if their names are not on the board and an entry of the board is compared with
+    them.
     """
     from rsbench.benchmark.leaderboard.board import entries_of
     from rsbench.benchmark.leaderboard.standings import standings, table

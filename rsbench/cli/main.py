@@ -78,7 +78,7 @@ def _root(
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *where: object, **more: object) -> None:
-    """A warning meant for users, as one line; warnings for programmers are not shown."""
+    """Print a warning for users (FutureWarning) as one line; other warnings are not shown."""
     if issubclass(category, FutureWarning):
         typer.echo(f"rsbench: note: {printable(str(message))}", err=True)
 
@@ -115,7 +115,7 @@ _NAMELESS = {
     errno.EDQUOT: "standard output",
     errno.ENOENT: "the working folder, which must exist",
 }
-"""What a failed system call was about where the error names no file, by error number."""
+"""Object of a failed system call whose error names no file, by error number."""
 
 
 def run() -> None:
@@ -131,14 +131,14 @@ def run() -> None:
     except MemoryError:
         _fail("not enough memory; close other programs, or process less at once", 1)
     except Exception as error:
-        # A folder without permission, wherever it is; or no file name, as for a full disk behind stdout.
+        # Such as a folder without permission; errors without a file name, such as a full disk at stdout, too.
         if isinstance(error, OSError) and (place := error.filename or _NAMELESS.get(error.errno or 0)):
             _fail(f"{place}: {error.strerror or error}")
         _fail(exits.describe(error), exits.EXIT_CODE)
 
 
 def _with_one_command(whole: Callable[..., Any], words: Sequence[str]) -> Callable[..., Any]:
-    """The program with the one command that the words name, since making the options of all takes 30 ms."""
+    """Return the program with only the command that is called, as creating the options of all takes 30 ms."""
     name = next((word for word in words if not word.startswith("-")), None)
     if not isinstance(whole, typer.Typer):
         return whole

@@ -228,7 +228,7 @@ def _text(value: object) -> str:
 
 
 def _kinds_of(name: str, kind: str | None) -> list[str]:
-    """The kinds that have this name."""
+    """Return the kinds that have a component or card of this name, or the given kind."""
     from rsbench.components.cards import choices, current_name
 
     kinds = kind_names()
@@ -249,7 +249,7 @@ def _kinds_of(name: str, kind: str | None) -> list[str]:
 
 
 def _about(name: str, kind: str) -> dict[str, Any]:
-    """All properties of one component or card."""
+    """Return all properties of one component or card."""
     from rsbench.components import plugins
     from rsbench.components.cards import FORMER_NAMES, card_path, read_toml
 
@@ -275,7 +275,7 @@ def _about(name: str, kind: str) -> dict[str, Any]:
 
 
 def _about_component(component: object) -> dict[str, Any]:
-    """Its class, and the fields of its ``spec``, as JSON holds them."""
+    """Return the class of a component and the fields of its ``spec``, as values for JSON."""
     cls = type(component)
     about: dict[str, Any] = {"class": f"{cls.__module__}:{cls.__qualname__}"}
     spec = getattr(component, "spec", None)
@@ -294,7 +294,7 @@ def _offer(kind: Kind[Any, Any], name: str) -> Offer:
 
 
 def _about_class(kind: Kind[Any, Any], name: str) -> dict[str, Any]:
-    """A class without a card of its own; other cards name it and set its parameters."""
+    """Describe a class that has no card itself; other cards name it and set its parameters."""
     from rsbench.components import plugins
 
     cls, offer = plugins.load_class(kind, name, Path()), _offer(kind, name)

@@ -1,4 +1,4 @@
-"""``rsbench reproduce``: the committed results, made again."""
+"""``rsbench reproduce``: make the committed results again."""
 
 from __future__ import annotations
 
@@ -54,16 +54,16 @@ class _Recipe(NamedTuple):
     """How a target is made."""
 
     maker: str
-    """``module:function`` below ``rsbench.cli``; takes those of ``out``, ``data``, ``workers``, ``seeds`` and
-    ``width`` that it names."""
+    """``module:function`` below ``rsbench.cli``; its parameters are any of ``out``, ``data``, ``workers``,
+    ``seeds`` and ``width``."""
     minutes: int
-    """On two cores, as measured in November 2026: for estimates of the remaining time."""
+    """Time on two cores, measured in November 2026, for estimates of the remaining time."""
     rendered: tuple[str, ...] = ()
-    """Folders of datasets below ``--data`` that it reads, and renders first where they are missing."""
+    """Folders of datasets below ``--data`` that it reads; missing ones are rendered first."""
     folders: tuple[str, ...] = ()
-    """Where it writes below ``--out``, if not in the folder of its name: they are there when it is called."""
+    """Folders below ``--out`` that it writes to, by default that of its name; they are created before the call."""
     seeds: int = 1
-    """Runs of each solver in the committed results."""
+    """Number of runs of each solver in the committed results."""
 
 
 class Target(StrEnum):
@@ -107,9 +107,10 @@ _ORDER = (
     *(each for each in Target if each not in ("fig3", "fig4-literal", "image-claims", "everything")),
     Target.image_claims,
 )
-"""Targets of ``everything``: ``claims`` makes Figure 3, ``fig4`` its literal part; image claims need the rest."""
+"""Targets of ``everything``: ``claims`` includes fig3, ``fig4`` includes fig4-literal; image claims come last, as
+they judge the results of the others."""
 _KEPT = 0.1
-"""Fraction of its minutes below which a target must have been made before."""
+"""Share of its expected time below which a target is assumed to have existed already."""
 
 
 def reproduce(
@@ -168,7 +169,7 @@ def reproduce(
 def _make(
     targets: Sequence[Target], out: Path, data: Path, workers: int | None, seeds: int | None, width: int | None
 ) -> None:
-    """One after the other, with the time that each took, and of several with what is left."""
+    """Make targets one after the other; print the time of each and, for several, the estimated remaining time."""
     begin, paces = time.monotonic(), list[float]()
     for number, each in enumerate(targets):
         start = time.monotonic()
@@ -182,7 +183,7 @@ def _make(
 
 
 def _left(targets: Sequence[Target], paces: Sequence[float]) -> str:
-    """About how long the next target, and all of them, take by the pace of those that were made so far."""
+    """Text: estimated time of the next target and of all remaining ones, from the time that previous ones took."""
     made = [pace for pace in paces if pace > _KEPT]
     minutes = [each.recipe.minutes * (statistics.median(made) if made else 1.0) for each in targets]
     begin = _about(minutes[0])
@@ -194,7 +195,7 @@ def _about(minutes: float) -> str:
 
 
 def _first(target: Target, data: Path) -> str:
-    """What is rendered or needed before a target is made."""
+    """Text: what is rendered or required before a target is made; empty if nothing."""
     if target is Target.image_claims:
         return "; judges what the other targets have written: make them first"
     places = [data / name for name in target.recipe.rendered]

@@ -1,4 +1,4 @@
-"""Targets of ``rsbench reproduce`` about depth and correction: fig4 and its literal one, correction, sgm, real."""
+"""Targets of ``rsbench reproduce`` on depth and correction: fig4, fig4-literal, (laws-)correction, sgm, real."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ LAWS_FRAMES = "laws-frames"
 STRATA = ("mild", "moderate", "aggressive", "poles")
 SCENES = ("castle", "old-town", "room")
 _FIG4 = (("paper", ""), ("moderate", "-2"), ("aggressive", "-2"))
-"""Cards of the figure, and what their sequences' names add to the scene's."""
+"""Cards of the figure, and the endings that are added to a scene's name for the names of their sequences."""
 _LITERAL_SCENE, _LITERAL_SEEDS = "castle", 10
-"""Sequence of the paper's card, and how many seeds of RANSAC are scored; the first is drawn."""
+"""Sequence of the paper's card, and number of RANSAC seeds that are scored; the result of the first is drawn."""
 _SHOWN = "castle-aggressive-2"
 """Sequence in the picture of real cameras."""
 _SGM = (("mild", "castle-2"), ("moderate", "castle-2"), ("mild", "room-3"), ("moderate", "room-3"))
@@ -102,7 +102,7 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
     images, bands, motions = (pd.concat(table, ignore_index=True) for table in zip(*studies, strict=True))
     write_table(folder / "views.csv", images)
     write_table(folder / "motions.csv", motions)
-    # From the stored figures, so that the summary can be made again from the file to the last digit.
+    # Computed from the stored table, so that the summary can be reproduced from the file exactly.
     stored = pd.read_csv(folder / "views.csv")
     write_table(folder / "summary.csv", summarise(stored))
     write_table(folder / "scenes.csv", by_scene(stored))
@@ -126,7 +126,10 @@ def laws_correction(out: Path, data: Path, workers: int | None = None) -> None:
 def _studied(
     card: str, name: str, data: Path, workers: int | None, among: Callable[[str], bool] = bool
 ) -> list[pd.DataFrame]:
-    """Views, bands of rows and motions, of sequences ``among`` those of a card whose folder is ``name``."""
+    """Run the correction study on a card's sequences selected by ``among``; its dataset is in the folder ``name``.
+
+    Returns tables of views, bands of rows, and motions.
+    """
     _generate(card, data, name)
     folder, kept = data / name, data / "correction" / name
     count = sum(among(sequence.name) for sequence in read_dataset(folder))
@@ -181,7 +184,7 @@ def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
         )
     write_table(folder / "motions.csv", motions)
     write_table(folder / "views.csv", views)
-    # From the stored figures, so that the summary can be made again from the files to the last digit.
+    # Computed from the stored tables, so that the summary can be reproduced from the files exactly.
     stored = (
         pd.read_csv(folder / f"{name}.csv", keep_default_na=False, na_values=[""]) for name in ("motions", "views")
     )
@@ -212,7 +215,7 @@ def _write_provenance(folder: Path, target: str, datasets: Iterable[Path], name:
 
 
 def _generate(card: str, data: Path, name: str = "") -> None:
-    """Render what is missing of a card: all its sequences, so that every target finds the same dataset."""
+    """Render the missing sequences of a card; always all of them, so that every target gets the same dataset."""
     generate(card, str(data / (name or card)), None, workers=1)
 
 

@@ -1,5 +1,5 @@
 """``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``, ``footage``, ``recorded``, ``held-out``:
-what comes with rsbench, on tracks."""
+the boards with the entries of rsbench."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from rsbench.vision.stereo_matcher import STEREO_MATCHERS
 
 BOARD, LAWS, HANDHELD, FOOTAGE, RECORDED = "leaderboard", "laws", "handheld", "footage", "recorded"
 HELD_OUT = "held-out"
-"""Folders of the boards below ``--data``."""
+"""Names of folders of boards and their results."""
 OWN_RECORDINGS = "euroc"
 """Folder below ``--data`` of recordings that do not come with rsbench."""
 SAME_METHOD = {
@@ -45,18 +45,18 @@ SAME_METHOD = {
     "rs-stereo-linear-symmetric": "rs-stereo-linear",
     "rs-stereo-tracks": "rs-stereo-refined",
 }
-"""Cards that are left out, each with the entry that stands for its method: versions that answer alike cost all
-others power, because the comparison of every pair is corrected for their number."""
+"""Cards that are left out, each with the entry that represents its method: similar versions would reduce the power
+of all comparisons, which are corrected for the number of pairs."""
 COMPARED = (
     *("rs-stereo-auto", "rs-stereo-refined", "rs-stereo-refined-twist", "gs-stereo-tracks-scaled", "gs-poselib"),
     *("gs-poselib-scaled", "gs-8pt", "gs-5pt-opencv", "rs-mono-refined", "gs-poselib-stereo", "rs-r6p"),
     "rs-stereo-linear",
 )
-"""Entries of ours that are run on held-out splits."""
+"""Entries of rsbench that are run on held-out splits."""
 _PUBLISHED = {"points-1": BOARD, "points-2": LAWS}
-"""Folders of results with what entries of ours answered on the public splits."""
+"""Folders of results with the published predictions of rsbench's entries on the public splits."""
 _OF_ONE_CAMERA = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers", "gyro", "fusion")
-"""Correctors of one camera, and that of a rig for what a second one is worth."""
+"""Correctors of one camera, and the rig's corrector, to show the benefit of a second camera."""
 
 
 def leaderboard(out: Path, data: Path, workers: int | None) -> None:
@@ -178,7 +178,7 @@ def solvers_of_others() -> list[str]:
 
 
 def _check_announced(split: Split, seed_file: Path, commitment: str, fingerprint: str) -> None:
-    """Raises RsbenchError where a secret split or its text is not the announced one."""
+    """Raise RsbenchError if a secret split or its seed text is not the announced one."""
     if read_secret(seed_file).commitment != commitment or split.fingerprint != fingerprint:
         raise RsbenchError(f"{seed_file}: draws {split.name}, which announced.json beside it does not announce")
 
@@ -192,9 +192,9 @@ def _fill(
     *,
     oracles_too: bool = True,
 ) -> None:
-    """Run entries by track where they have not run yet, and add the oracles.
+    """Run the entries of each track that have not run yet, and add the oracles.
 
-    ``frames`` is the dataset of ``card``, rendered where it is missing, for the tracks of frames.
+    ``frames`` is the folder of the dataset of ``card``, for tracks on frames; missing sequences are rendered.
     """
     count = workers or os.cpu_count() or 1
     if frames is not None:
@@ -262,6 +262,6 @@ def publish(
         name: {key: record[key] for key in ("command", "commit", "source", "date") if key in record}
         for name, record in made.items()
         if isinstance(record, dict)
-        and not (name in former and "commit" not in record)  # restored from its answers
+        and not (name in former and "commit" not in record)  # restored from its predictions
     }
     write_json(path, {**provenance(command), "entries": dict(sorted((kept | brief).items()))})

@@ -1,4 +1,4 @@
-"""``rsbench reproduce`` of simulated points: Figure 3, the claims, the readings, the other sweeps."""
+"""Targets of ``rsbench reproduce`` on simulated points: fig3, claims, image-claims, readings, sweeps."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def claims(out: Path, data: Path, workers: int | None) -> None:
 def _claim_tables(
     fig3_folder: Path, folder: Path, home: Path, workers: int | None, command: str
 ) -> dict[str, dict[str, pd.DataFrame]]:
-    """Summaries of the sweeps of Figure 3 by the matches per camera, with the readings of the paper's solver."""
+    """Summaries of the sweeps with all readings of the paper's solver, by matches per camera and sweep."""
     hundred = read_summaries(fig3_folder, SWEEPS)
     tables: dict[str, dict[str, pd.DataFrame]] = {"100 + 100": {}, "9 + 9": {}}
     for name in SWEEPS:
@@ -108,8 +108,8 @@ def _claim_tables(
 
 
 def _with_readings(name: str, points: int | None, home: Path, workers: int | None, command: str) -> pd.DataFrame:
-    """Summary of a sweep of the paper run with the readings of its solver; where Figure 3 has none, also with what
-    they are compared with."""
+    """Run a sweep of the paper with the readings of its solver; returns the summary. Unless there are 100 points,
+    as in Figure 3, the solvers for comparison are run too."""
     others = () if points == 100 else (OURS, GLOBAL)
     card = replace(load_sweep(name), solvers=(*write_cards(home / "readings", readings_of(name, points)), *others))
     folder = home / (f"{name}-readings" if points is None else f"{name}-{points}-readings")

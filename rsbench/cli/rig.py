@@ -1,4 +1,4 @@
-"""``rsbench rig``: what is understood of a calibration, and its conversion."""
+"""``rsbench rig``: show how a calibration is understood, and convert it."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _size(option: str, text: str) -> Size:
 def _assumptions(
     size: Size | None, unit: str | None, lens: str | None, invert: bool, exchange: bool
 ) -> Assumptions:
-    """Raises RsbenchError for a unit or a lens that there is not."""
+    """Parse the options. Raises RsbenchError for an unknown unit or lens."""
     from rsbench.interop.readers.calibration_parts import UNITS, Assumptions
 
     metres = None
@@ -138,7 +138,7 @@ def _assumptions(
 
 
 def _known_rig(found: Calibration) -> StereoRig | None:
-    """The rig where all is known of it."""
+    """Return the rig; None if there is one camera, or an image size is unknown."""
     from rsbench.interop.writers.calibrations import rig_of
 
     known = found.right is not None and "width" in found.left and "width" in found.right
@@ -158,7 +158,7 @@ def _convert(found: Calibration, to: str | None, out: Path, json: bool) -> None:
 
 
 def _lines(found: Calibration) -> list[str]:
-    """What was understood, for people."""
+    """Describe the calibration as lines of text."""
     record = _record(found)
     names = ", ".join(path.name for path in found.files)
     lines = [f"{found.format}{f' ({names})' if names else ''}"]
@@ -199,7 +199,7 @@ def _lines(found: Calibration) -> list[str]:
 
 
 def _record(found: Calibration) -> dict[str, Any]:
-    """What was understood, for programs."""
+    """Describe the calibration as a JSON object."""
     import numpy as np
 
     from rsbench.core import so3
@@ -242,7 +242,7 @@ def _record(found: Calibration) -> dict[str, Any]:
 
 
 def _rows_apart(rig: StereoRig) -> list[float] | None:
-    """Least and largest difference of rows, right less left in the left image's scale, of points at infinity."""
+    """Least and largest row difference, right minus left, of points at infinity in both images; None: none."""
     import numpy as np
 
     left, right = rig.sensor("left"), rig.sensor("right")

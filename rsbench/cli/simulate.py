@@ -120,7 +120,7 @@ GIVEN = {
 
 
 _SMALL = 0.1
-"""Degrees: a column whose medians are all below it is in thousandths."""
+"""A column whose medians are all below this, degrees, is shown in thousandths of degrees."""
 
 
 def show(card: SweepCard, table: pd.DataFrame) -> None:
@@ -156,7 +156,7 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
         for row in records:
             if row["failures"]:
                 say(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
-    rolling = table[table.shutter == "rolling"]  # other shutters have no time between rows
+    rolling = table[table.shutter == "rolling"]  # with a global shutter, there is no time between rows
     for (solver, assumed), rows in rolling.groupby(["solver", "assumed_motion"], sort=False):
         others = sorted(set(rows.motion_model) - {assumed})
         if others:
@@ -167,7 +167,7 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
 
 
 def _changes(assignments: list[str]) -> dict[str, object]:
-    """FIELD=VALUE pairs; values as in a card, plain words may lack their quotes."""
+    """Parse FIELD=VALUE pairs; values are as in a card, but words need no quotes."""
     changes: dict[str, object] = {}
     for text in assignments:
         key, equals, value = text.partition("=")
@@ -177,6 +177,6 @@ def _changes(assignments: list[str]) -> dict[str, object]:
             changes[key.strip()] = tomllib.loads(f"value = {value}")["value"]
         except tomllib.TOMLDecodeError:
             changes[key.strip()] = value.strip()
-        except (ValueError, RecursionError) as error:  # a number of thousands of digits, or brackets
+        except (ValueError, RecursionError) as error:  # for thousands of digits or brackets
             raise RsbenchError(f"--set {key}: not a value of TOML: {error}") from error
     return changes

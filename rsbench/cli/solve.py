@@ -1,4 +1,4 @@
-"""``rsbench solve``: problems of people with their own correspondences, one or many in one process."""
+"""``rsbench solve``: solve problems with a user's own correspondences, one or many in one process."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def _answers(
     time_limit: float | None,
     motion_model: str,
 ) -> Iterator[dict[str, Any] | RsbenchError]:
-    """One answer per problem and solver, or the error that a problem is."""
+    """Yield an answer for each problem and solver, or the error of an invalid problem."""
     from rsbench.pipeline.answer import solve_problem
     from rsbench.pipeline.isolated_components import SolverRunner
     from rsbench.pipeline.problem import read_problems
@@ -147,7 +147,7 @@ def _show_one(answer: dict[str, Any]) -> None:
 
 
 def _readout(answer: dict[str, Any]) -> str:
-    """What was found of the shutter, and what else the matches allow."""
+    """Text on the estimated shutter, and on the second most probable one."""
     found = answer["readout"]
     sides = [found["left"]] if found["left"] == found["right"] else [found["left"], found["right"]]
     text = f"ratio {answer['readout_ratio']:.3f} +- {found['readout_ratio_sigma']:.3f} from {' and '.join(sides)}"

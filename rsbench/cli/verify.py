@@ -1,4 +1,4 @@
-"""``rsbench verify``, a check of a dataset against its card, its manifests and itself, and ``rsbench digest``."""
+"""``rsbench verify``: check a dataset against its card, its manifests and itself; and ``rsbench digest``."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def verify(
 
 
 def _reference_faults(folder: Path) -> list[str]:
-    """What differs from the reference copy, after telling what does not."""
+    """Return the differences from the reference copy, and print how many sequences agree."""
     from rsbench.verification.digests import against_reference
 
     found = list(against_reference(folder))
@@ -126,7 +126,8 @@ def _reference_faults(folder: Path) -> list[str]:
 
 
 def _verify_others(folder: Path, layout: str) -> None:
-    """Files, sizes, depth and matches under poses and row times, and disparities, as far as a layout has them."""
+    """Check a dataset in another layout, as far as it has them: files, sizes, disparities, and depth and matches
+    by the poses and row times."""
     from rsbench.interop.readers.check import NEAR_PX, agreements, disparity_faults, file_faults, sights
     from rsbench.interop.readers.layouts import read_others
 

@@ -1,9 +1,9 @@
-"""Cards: the TOML files that users read, copy, edit and compare, parsed into frozen dataclasses.
+"""Cards: TOML files that users read, copy, edit and compare, parsed into frozen dataclasses.
 
-A card is given by name (``castle``, one of those that come with rsbench) or by path (``my/castle.toml``). Parsing
-is strict: unknown keys, wrong types and numbers that are not finite are refused in one line that names the file,
-the field, the value and what is allowed. The key ``shutter`` of several kinds
-names a shutter card, the readout time of a real camera.
+A card is given by name (``castle``, a card that comes with rsbench) or by path (``my/castle.toml``). Parsing is
+strict: unknown keys, wrong types and numbers that are not finite raise a one-line error with the file, the field,
+the value and the allowed values. In several kinds of cards, the key ``shutter`` names a shutter card with the
+readout time of a camera.
 """
 
 from __future__ import annotations
@@ -63,12 +63,12 @@ def list_cards(kind: CardKind) -> dict[str, Path]:
 
 
 def current_name(kind: str | None, name: str) -> str:
-    """The present name of a component or card, from that or a former name."""
+    """Return the present name of a component or card, given its present or former name."""
     return FORMER_NAMES.get(kind or "", {}).get(name, name)
 
 
 def name_of_today(kind: str | None, name: str) -> str:
-    """``current_name`` of a name that a user gave; warns of a former name."""
+    """Return ``current_name`` of a name given by a user, with a warning if it is a former name."""
     now = current_name(kind, name)
     if now != name:
         text = f"{kind}: {name!r} is now called {now!r}; the old name is read until {FORMER_UNTIL}"
@@ -122,17 +122,17 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_card(cls: type[T], data: Mapping[str, Any], where: str, *, extra: Extra = "forbid") -> T:
-    """Turn the tables of a card, or what JSON holds, into the dataclass ``cls``.
+    """Convert the tables of a card, or data from JSON, to the dataclass ``cls``.
 
-    Types are strict (no text for a number, no truth value for a number; a whole number may stand for a real
-    one), numbers are finite, and a key that no field has is refused at every level of nesting. A
-    ``ValueError`` or ``RsbenchError`` from a ``__post_init__`` becomes part of the one-line message.
+    Types are strict: text or a bool is not accepted as a number, but an integer is accepted as a float. Numbers
+    must be finite, and unknown keys raise an error at every level of nesting. A ``ValueError`` or ``RsbenchError``
+    from a ``__post_init__`` becomes part of the one-line message.
 
     Args:
         cls: a dataclass whose fields are scalars, ``Literal``s, tuples, dicts and further dataclasses.
-        data: what ``tomllib`` or ``json`` read.
+        data: result of ``tomllib`` or ``json``.
         where: the file, for messages.
-        extra: "ignore" passes over keys that no field has, as a reader of files of later versions must.
+        extra: "ignore" skips unknown keys, as is needed to read files of later versions.
 
     Raises:
         RsbenchError: one line with ``where``, the dotted field, the value and what is allowed.
@@ -151,18 +151,20 @@ def parse_card(cls: type[T], data: Mapping[str, Any], where: str, *, extra: Extr
 
 @functools.lru_cache(maxsize=64)
 def _adapter(cls: type, extra: Extra) -> TypeAdapter[Any]:
-    """Cached: making one takes a hundred times as long as using it.
+    """Return pydantic's adapter for a dataclass, cached because creating it takes a hundred times as long as using
+    it.
 
-    pydantic has no settings for a standard dataclass itself; those of a container apply to it.
+    pydantic accepts no configuration for a standard dataclass itself, but that of a containing tuple applies to
+    it.
     """
     config = ConfigDict(extra=extra, strict=True, allow_inf_nan=False)
     return TypeAdapter(tuple[cls], config=config)
 
 
 def check_values(data: Mapping[str, Any], where: str) -> None:
-    """Refuse numbers that are not finite, at any depth, and too deep nesting.
+    """Reject numbers that are not finite, at any depth, and data that are nested too deeply.
 
-    Fields typed ``Any`` would accept both.
+    Fields of type ``Any`` would accept both.
 
     Raises:
         RsbenchError: one line with ``where`` and the dotted field.
@@ -183,11 +185,11 @@ def check_values(data: Mapping[str, Any], where: str) -> None:
 
 
 _LISTED, _COMPARED = 10, 100
-"""Names that a message lists at most, and characters of a wrong one that they are compared with."""
+"""Largest number of names in a message, and number of characters of a wrong name used to find similar ones."""
 
 
 def choices(value: str, names: Iterable[str]) -> str:
-    """End of a message about an unknown name: the nearest name, then those that exist, or the nearest of many."""
+    """Return the end of a message about an unknown name: the most similar name and up to ten known ones."""
     known, value = sorted(names), value[:_COMPARED]
     near = difflib.get_close_matches(value, known, n=1)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
@@ -199,7 +201,7 @@ def choices(value: str, names: Iterable[str]) -> str:
 
 
 def shipped_folder(in_checkout: str, in_wheel: str) -> Path:
-    """A folder that comes with rsbench: below the top of a checkout, or in the package data of a wheel."""
+    """Return a folder that comes with rsbench, in a checkout or in the package data of a wheel."""
     package = Path(str(resources.files("rsbench")))
     checkout = package.parent
     return checkout / in_checkout if (checkout / "pyproject.toml").is_file() else package / in_wheel
@@ -211,7 +213,7 @@ def _card_folder(kind: CardKind) -> Path:
 
 
 def _first_problem(cls: type, error: ValidationError) -> str:
-    """One problem of many; a misspelt key first, for it also causes the 'required' ones."""
+    """Describe the first problem; unknown keys first, since a misspelt key also causes 'required' ones."""
     problems = error.errors(include_url=False)
     problem = next((item for item in problems if item["type"] in _UNKNOWN_KEY), problems[0])
     location = problem["loc"][1:]
@@ -238,7 +240,7 @@ def _short(value: object) -> str:
 
 
 def _keys_at(kind: Any, location: Sequence[int | str]) -> list[str]:
-    """Field names of the dataclass found by walking ``location`` down from the type ``kind``."""
+    """Return the field names of the dataclass at ``location`` below the type ``kind``."""
     if get_origin(kind) in (Union, UnionType):
         return [key for option in get_args(kind) for key in _keys_at(option, location)]
     if dataclasses.is_dataclass(kind):
@@ -293,10 +295,11 @@ class ShutterCard:
 
 
 def with_shutter(table: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """A table of a card, ``shutter = NAME`` replaced by ``readout_ratio`` and, unless given, ``frame_period_s``.
+    """Replace ``shutter = NAME`` in a table of a card by ``readout_ratio`` and, unless given, ``frame_period_s``.
 
     Raises:
-        RsbenchError: no such shutter, a readout ratio beside it, or a frame period shorter than its readout.
+        RsbenchError: the shutter does not exist, a readout ratio is given too, or the frame period is shorter than
+            the readout.
     """
     if "shutter" not in table:
         return dict(table)
@@ -320,16 +323,16 @@ def with_shutter(table: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def with_shutters(card: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """A dataset's card with every ``shutter`` replaced; RsbenchError as ``with_shutter``."""
+    """Replace every ``shutter`` in a dataset's card; raise RsbenchError like ``with_shutter``."""
     return in_all_tables(card, lambda table: with_shutter(table, where))
 
 
 def in_all_tables(
     card: Mapping[str, Any], change: Callable[[Mapping[str, Any]], dict[str, Any]]
 ) -> dict[str, Any]:
-    """A dataset's card in which its own table, those of its sequences and of values of its grid are changed.
+    """Apply a change to a dataset's card: to its own table, to those of its sequences and to values of its grid.
 
-    Values of wrong types stay for the parser to refuse.
+    Values of wrong types are left unchanged, so that the parser reports them.
     """
 
     def replaced(value: Any) -> Any:

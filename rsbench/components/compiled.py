@@ -59,7 +59,7 @@ def compiled(function: F) -> F: ...
 @overload
 def compiled(**options: Any) -> Callable[[F], F]: ...
 def compiled(function: F | None = None, **options: Any) -> F | Callable[[F], F]:
-    """Compile at the first call, once per installation; ``options`` are those of ``numba.njit``."""
+    """Decorate a function to be compiled at its first call and cached; ``options`` are those of ``numba.njit``."""
     if function is None:
         return functools.partial(compiled, **options)
     dispatcher = njit(nogil=True, no_cfunc_wrapper=True, **options)(function)
@@ -69,7 +69,7 @@ def compiled(function: F | None = None, **options: Any) -> F | Callable[[F], F]:
 
 
 class _Locator:
-    """Names a function in the cache; ``cache_folder`` alone decides where the cache is."""
+    """Numba's locator of a function in the cache; the folder is determined by ``cache_folder`` alone."""
 
     def __init__(self, py_func: Callable[..., object], py_file: str) -> None:
         self._py_file = py_file
@@ -88,7 +88,7 @@ class _Implementation(CompileResultCacheImpl):
 
 
 class _KernelCache(FunctionCache):
-    """Numba's cache of one function, with one index per signature; a file that cannot be read is made again."""
+    """Numba's cache of one function, with one index per signature; an unreadable file is written again."""
 
     def __init__(self, py_func: Callable[..., object]) -> None:
         self._name, self._py_func = repr(py_func), py_func
@@ -100,7 +100,7 @@ class _KernelCache(FunctionCache):
         return str(cache_folder() or "")
 
     def flush(self) -> None:
-        """Nothing to do: another version of the sources has another folder."""
+        """Do nothing, because another version of the sources has another folder."""
 
     def _file(self, folder: Path | None, sig: tuple[Any, ...], key: Any) -> IndexDataCacheFile | None:
         # The hash of the folder does not cover the code of a foreign type.
@@ -110,7 +110,7 @@ class _KernelCache(FunctionCache):
         return IndexDataCacheFile(str(folder), f"{self._impl.filename_base}-{signature}", source_version())
 
     def load_overload(self, sig: tuple[Any, ...], target_context: Any) -> Any:
-        """Without loading Numba's compiler, which takes as long as a solve; compiling loads it."""
+        """Load cached code without loading Numba's compiler, which takes as long as a solve."""
         rtsys.initialize(target_context)  # memory of arrays
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
@@ -143,13 +143,13 @@ class _KernelCache(FunctionCache):
 
 
 class _Stopwatch:
-    """Warn in one line, once, if compiling takes long."""
+    """Warns once, in one line, if compiling takes long."""
 
     def __init__(self) -> None:
         self.depth, self.started, self.seconds, self.warned = 0, 0.0, 0.0, False
 
     def begin(self) -> None:
-        """Compiling of a function begins; functions that it calls are compiled inside."""
+        """Start timing the compilation of a function; functions that it calls are compiled within this time."""
         now = time.perf_counter()
         if self.depth == 0:
             self.started = now
@@ -169,7 +169,7 @@ _STOPWATCH = _Stopwatch()
 
 @functools.cache
 def source_version() -> str:
-    """Hash of all sources of rsbench that hold compiled code."""
+    """Return the hash of all source files of rsbench with compiled code."""
     package = Path(str(resources.files("rsbench")))
     # By text, not by ``Path``, since each command does this before it loads compiled code.
     files = (f"{folder}/{name}" for folder, _, names in os.walk(package) for name in names if name.endswith(".py"))
@@ -184,7 +184,7 @@ def _holds_compiled_code(file: str) -> bool:
 
 @functools.cache
 def cache_folder() -> Path | None:
-    """Folder of the compiled code of these sources, made if missing; None if it cannot be written."""
+    """Return the cache folder for the present sources, created if missing; None if it is not writable."""
     for base in (Path(config.CACHE_DIR) if config.CACHE_DIR else None, user_cache(), temporary()):
         if base is None:
             continue
@@ -203,13 +203,13 @@ def cache_folder() -> Path | None:
 
 @functools.cache
 def shipped_folder() -> Path | None:
-    """Folder of portable code of these sources; None if there is none, or this processor cannot run it."""
+    """Return the folder of portable code for the present sources; None if missing or unusable here."""
     folder = Path(str(resources.files("rsbench"))) / SHIPPED / "kernels" / source_version()[:16]
     return folder if folder.is_dir() and runs_portable_code() else None
 
 
 def runs_portable_code() -> bool:
-    """Whether this processor, under this system, has all features that portable code may use."""
+    """Return whether processor and operating system support all features that portable code may use."""
     if platform.machine().lower() not in ("x86_64", "amd64"):
         return False
     features = binding.get_host_cpu_features()
@@ -217,7 +217,7 @@ def runs_portable_code() -> bool:
 
 
 def _remove_old(folder: Path) -> None:
-    """Remove code of other versions whose folder has not changed for a month, and nothing else."""
+    """Remove folders of other versions that have not changed for a month, and nothing else."""
     oldest = time.time() - _KEPT_DAYS * 86400
     for other in folder.parent.iterdir():
         with contextlib.suppress(OSError):  # another process removed it first

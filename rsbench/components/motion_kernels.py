@@ -1,7 +1,7 @@
-"""Kernels of motion models as Numba sees them, and the compiled vector algebra that they may call.
+"""Kernels of motion models, their Numba type, and compiled vector algebra that they may call.
 
-Vectors are tuples, which need no memory; rotations are (3, 3) arrays. The readable NumPy forms of the vector
-functions are in ``rsbench.core.so3``.
+Vectors are tuples, which need no allocation; rotations are (3, 3) arrays. The more readable NumPy versions of the
+vector functions are in ``rsbench.core.so3``.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def dot(a: Vector, b: Vector) -> float:
 
 @compiled
 def plus(a: Vector, scale: float, b: Vector) -> Vector:
-    """a + scale b."""
+    """Return a + scale b."""
     return (a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2])
 
 
@@ -78,8 +78,8 @@ def apply_transposed(R: FloatArray, a: Vector) -> Vector:
 
 @compiled
 def coefficients(s: float) -> tuple[float, float, float, float, float]:
-    """sin t/t, b = (1 - cos t)/t^2, c = (t - sin t)/t^3 of s = t^2, then b'/t and c'/t."""
-    if s < 1e-2:  # the closed forms cancel
+    """Return sin t/t, b = (1 - cos t)/t^2, c = (t - sin t)/t^3 for s = t^2, then b'/t and c'/t."""
+    if s < 1e-2:  # the closed forms suffer from cancellation
         a = 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72)))
         b = 0.5 - s / 24 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90)))
         c = 1 / 6 - s / 120 * (1 - s / 42 * (1 - s / 72 * (1 - s / 110)))
@@ -95,7 +95,7 @@ def coefficients(s: float) -> tuple[float, float, float, float, float]:
 
 @compiled
 def fill_rotation(phi: Vector, identity: float, skew: float, outer: float, out: FloatArray) -> None:
-    """out = identity I + skew [phi]x + outer phi phi^T."""
+    """Fill out = identity I + skew [phi]x + outer phi phi^T."""
     for i in range(3):
         for j in range(i, 3):
             out[i, j] = outer * phi[i] * phi[j]
@@ -114,21 +114,21 @@ Moved = tuple[Vector, Vector, Vector, Vector, Vector]
 
 
 class MotionKernel(ABC):
-    """The motion between two rows as a compiled function of six parameters theta = (w, v).
+    """The motion between two rows as compiled functions of six parameters theta = (w, v).
 
-    A kernel is a frozen dataclass whose fields are numbers: those parameters of its model that it needs, under the
-    same names. Its methods ``move`` and ``translation_jacobian`` are compiled into the residuals, one copy for
-    each kernel, at no cost per call: they may use numbers, arrays and compiled functions, such as those of
-    ``vectors``. They must be the motion of the model's ``body_from_world``: from tau0 to tau1 the body moves by
+    A kernel is a frozen dataclass. Its fields are numbers: the parameters of its model that it needs, with the
+    same names. Its methods ``move`` and ``translation_jacobian`` are compiled into the residuals, once for each
+    kernel class, without overhead per call. They may use numbers, arrays and compiled functions, such as those of
+    this module. They must agree with ``body_from_world`` of the model: from tau0 to tau1 the body moves by
 
         R = R(tau1) R(tau0)^T,  T = t(tau1) - R t(tau0)     (the paper's equation (6), not linearised)
 
-    whose NumPy form, for any model, is ``rsbench.core.epipolar.row_pair_pose``.
+    The NumPy version for any model is ``rsbench.core.epipolar.row_pair_pose``.
     """
 
     @abstractmethod
     def move(self, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-        """Fill R (3, 3), and A (3, 3) with dR = [A dw]x R; R must not depend on v. Returns ``Moved``."""
+        """Fill R (3, 3), and A (3, 3) with dR = [A dw]x R, and return ``Moved``; R must not depend on v."""
 
     @abstractmethod
     def translation_jacobian(
@@ -144,15 +144,15 @@ class MotionKernel(ABC):
         """Fill T_w = dT/dw and T_v = dT/dv (3, 3); R and A are those of ``move``."""
 
     def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
-        """Parameters (6,) of the motion (w, d); not compiled."""
+        """Return the parameters (6,) for the motion (w, d); this method is not compiled."""
         return np.concatenate([w, d])
 
     def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """``(w, d)`` of the parameters; not compiled."""
+        """Return ``(w, d)`` for the parameters; this method is not compiled."""
         return theta[:3], theta[3:]
 
     def motion_jacobian(self, theta: FloatArray) -> FloatArray:
-        """Derivative (6, 6) of (w, d) by the parameters; not compiled."""
+        """Return the derivative (6, 6) of (w, d) by the parameters; this method is not compiled."""
         return np.eye(6)
 
 
@@ -161,10 +161,11 @@ KERNELS: dict[type[Motion], type[MotionKernel]] = {}
 
 
 def kernel_for(model: type[Motion]) -> Callable[[Class], Class]:
-    """Class decorator that gives a motion model its kernel.
+    """Return a class decorator that registers a kernel for a motion model.
 
     Raises:
-        TypeError: the class is no such dataclass, or a compiled method has other arguments than the contract.
+        TypeError: the class is not a dataclass derived from ``MotionKernel``, or a compiled method has other
+            arguments than that of the base class.
     """
 
     def register(kernel: Class) -> Class:
@@ -182,7 +183,7 @@ def kernel_for(model: type[Motion]) -> Callable[[Class], Class]:
 
 
 class KernelType(types.Type):
-    """Numba's type of a kernel: one per class, whatever the numbers, so that code is compiled once per class."""
+    """Numba's type of a kernel; one per class, so that other parameters need no compilation."""
 
     def __init__(self, cls: type[MotionKernel]) -> None:
         self.cls = cls
@@ -191,7 +192,7 @@ class KernelType(types.Type):
 
     @property
     def foreign(self) -> bool:
-        """Whether another package owns the code, which must then not be kept on disk as ours."""
+        """Whether the kernel belongs to another package, so that rsbench must not cache its code on disk."""
         return self.cls.__module__.partition(".")[0] != "rsbench"
 
     @property
@@ -211,7 +212,7 @@ def _typeof(value: MotionKernel, context: object) -> KernelType:
 @register_model(KernelType)
 class _KernelModel(models.StructModel):
     def __init__(self, manager: Any, kind: KernelType) -> None:
-        # Never empty: an argument without members confuses the calling convention.
+        # The extra member is needed because Numba's calling convention fails for arguments without members.
         super().__init__(manager, kind, [(name, types.float64) for name in (*kind.members, "_")])
 
 
@@ -250,7 +251,7 @@ def _translation_jacobian(
 
 
 def _bare(function: Any) -> Any:
-    """The function without annotations, which Numba would compare with those of the functions above."""
+    """Return the function without annotations, which Numba would compare with those of the functions above."""
     return FunctionType(
         function.__code__, function.__globals__, function.__name__, function.__defaults__, function.__closure__
     )

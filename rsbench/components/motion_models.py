@@ -318,7 +318,10 @@ def rotate(w: Vector, a: float, R: FloatArray, A: FloatArray) -> None:
 
 @compiled(inline="always")  # else LLVM keeps the call, which costs a third of the residuals
 def linear_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-    """T = tau1 d - tau0 R d: the paper's (6) with R exact. NumPy: ``epipolar.row_pair_pose`` of LinearMotion."""
+    """Return T = tau1 d - tau0 R d and derivatives: the paper's (6) with exact R.
+
+    The NumPy version is ``epipolar.row_pair_pose`` of LinearMotion.
+    """
     w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
     rotate(w, tau1 - tau0, R, A)
     Rv = apply(R, v)
@@ -331,7 +334,7 @@ def linear_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: F
 def linear_translation_jacobian(
     theta: FloatArray, tau0: float, R: FloatArray, A: FloatArray, tau1: float, T_w: FloatArray, T_v: FloatArray
 ) -> None:
-    """dT/dw_j = -tau0 [A_j]x R d and dT/dd = tau1 I - tau0 R."""
+    """Fill dT/dw_j = -tau0 [A_j]x R d and dT/dd = tau1 I - tau0 R."""
     Rv = apply(R, (theta[3], theta[4], theta[5]))
     for j in range(3):
         column = cross((A[0, j], A[1, j], A[2, j]), Rv)
@@ -365,7 +368,7 @@ class LinearKernel(MotionKernel):
 
 @compiled
 def turned(phi: Vector, v: Vector) -> Vector:
-    """exp([phi]x) v."""
+    """Return exp([phi]x) v."""
     c0, c1, _, _, _ = coefficients(dot(phi, phi))
     once = cross(phi, v)
     return plus(plus(v, c0, once), c1, cross(phi, once))
@@ -373,7 +376,7 @@ def turned(phi: Vector, v: Vector) -> Vector:
 
 @compiled
 def inertial_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-    """T = a exp(tau1 w) v, a = tau1 - tau0."""
+    """Return T = a exp(tau1 w) v, a = tau1 - tau0, and derivatives."""
     w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
     a = tau1 - tau0
     rotate(w, a, R, A)
@@ -386,7 +389,7 @@ def inertial_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A:
 def inertial_translation_jacobian(
     theta: FloatArray, tau0: float, tau1: float, T_w: FloatArray, T_v: FloatArray
 ) -> None:
-    """dT/dw and dT/dv of ``inertial_move``."""
+    """Fill dT/dw and dT/dv of ``inertial_move``."""
     a, phi = tau1 - tau0, times(tau1, (theta[0], theta[1], theta[2]))
     ahead = turned(phi, (theta[3], theta[4], theta[5]))
     _, c1, c2, _, _ = coefficients(dot(phi, phi))
@@ -402,14 +405,14 @@ def inertial_translation_jacobian(
 
 @compiled
 def beta(k: float, tau: float) -> tuple[float, float]:
-    """beta(tau) of a constant acceleration k (Zhuang et al., ICCV 2017), 1 at tau = 1, and its derivative."""
+    """Return beta(tau) for constant acceleration k, with beta(1) = 1, and its derivative (Zhuang et al. 2017)."""
     scale = 2.0 / (2.0 + k)
     return scale * (tau + 0.5 * k * tau * tau), scale * (1.0 + k * tau)
 
 
 @compiled
 def accelerated_move(k: float, theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-    """``linear_move`` at the times beta(tau)."""
+    """Return ``linear_move`` at the times beta(tau), with derivatives by tau."""
     (beta0, speed0), (beta1, speed1) = beta(k, tau0), beta(k, tau1)
     T, rate0, rate1, spin0, spin1 = linear_move(theta, beta0, beta1, R, A)
     return T, times(speed0, rate0), times(speed1, rate1), times(speed0, spin0), times(speed1, spin1)
@@ -417,7 +420,7 @@ def accelerated_move(k: float, theta: FloatArray, tau0: float, tau1: float, R: F
 
 @compiled
 def twist_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: FloatArray) -> Moved:
-    """T = a J(a w) v, a = tau1 - tau0."""
+    """Return T = a J(a w) v, a = tau1 - tau0, and derivatives."""
     w, v = (theta[0], theta[1], theta[2]), (theta[3], theta[4], theta[5])
     rotate(w, tau1 - tau0, R, A)
     Rv = apply(R, v)
@@ -428,7 +431,7 @@ def twist_move(theta: FloatArray, tau0: float, tau1: float, R: FloatArray, A: Fl
 def twist_translation_jacobian(
     theta: FloatArray, tau0: float, tau1: float, A: FloatArray, T_w: FloatArray, T_v: FloatArray
 ) -> None:
-    """dT/dw and dT/dv of ``twist_move``."""
+    """Fill dT/dw and dT/dv of ``twist_move``."""
     a = tau1 - tau0
     twist_by_w(a, times(a, (theta[0], theta[1], theta[2])), (theta[3], theta[4], theta[5]), T_w)
     for i in range(3):
@@ -438,7 +441,7 @@ def twist_translation_jacobian(
 
 @compiled
 def twist_by_w(a: float, phi: Vector, v: Vector, T_w: FloatArray) -> None:
-    """dT/dw of T = a (v + b phi x v + c phi x (phi x v)), phi = a w."""
+    """Fill dT/dw of T = a (v + b phi x v + c phi x (phi x v)), phi = a w."""
     _, b, c, db, dc = coefficients(dot(phi, phi))
     once = cross(phi, v)
     along = plus(times(db, once), dc, cross(phi, once))
@@ -451,7 +454,7 @@ def twist_by_w(a: float, phi: Vector, v: Vector, T_w: FloatArray) -> None:
 
 @dataclass(frozen=True)
 class AnyLaw(MotionKernel):
-    """Any motion model of rsbench, by its number: one compiled function for all of them."""
+    """One kernel for all motion models of rsbench, selected by a number, so that code is compiled only once."""
 
     number: float
     acceleration: float = 0.0
@@ -513,7 +516,7 @@ class TwistKernel(AnyLaw):
 @kernel_for(InertialMotion)
 @dataclass(frozen=True)
 class InertialKernel(AnyLaw):
-    """Constant velocity in the world; v is that of the world in the body at time 0: T = a exp(tau1 w) v."""
+    """Constant velocity in the world; v is its velocity in the body at time 0: T = a exp(tau1 w) v."""
 
     number: float = 2.0
 
@@ -540,22 +543,22 @@ class AcceleratedKernel(AnyLaw):
 
 
 def any_law(kernel: MotionKernel) -> MotionKernel:
-    """The kernel as ``AnyLaw``; that of another package as it is."""
+    """Convert rsbench's kernels to ``AnyLaw``; return those of other packages unchanged."""
     if isinstance(kernel, LinearKernel):
         return AnyLaw(0.0)
     return AnyLaw(kernel.number, kernel.acceleration) if isinstance(kernel, AnyLaw) else kernel
 
 
 def quick_law(kernel: MotionKernel) -> MotionKernel:
-    """The kernel as solvers use it; that of the paper's model, the default, has its own code."""
+    """Return the kernel for solvers: ``LinearKernel``, the default, itself; others by ``any_law``."""
     return kernel if isinstance(kernel, LinearKernel) else any_law(kernel)
 
 
 def load_kernel(motion_name: str, parameters: Mapping[str, Any] | None = None) -> MotionKernel:
-    """Kernel of a motion model with such parameters.
+    """Return the kernel of a motion model with these parameters.
 
     Raises:
-        RsbenchError: no such model, it cannot have such parameters, or it has no kernel: one line.
+        RsbenchError: the model does not exist, does not accept the parameters, or has no kernel.
     """
     model = motion_model(motion_name)
     if model not in KERNELS:
@@ -565,11 +568,11 @@ def load_kernel(motion_name: str, parameters: Mapping[str, Any] | None = None) -
         )
     motion, kernel = make_motion(motion_name, np.zeros(3), np.zeros(3), parameters), KERNELS[model]
     names = [field.name for field in dataclasses.fields(kernel)]  # pyrefly: ignore[bad-argument-type]
-    if issubclass(kernel, AnyLaw):  # its number, and an acceleration that the model lacks, are no parameters
+    if issubclass(kernel, AnyLaw):  # some of its fields are not parameters of the model
         names = [name for name in names if hasattr(motion, name)]
     return kernel(**{name: float(getattr(motion, name)) for name in names})
 
 
 def has_kernel(motion_name: str) -> bool:
-    """Whether solvers can assume a motion model; RsbenchError when it does not exist."""
+    """Return whether solvers can assume a motion model; raise RsbenchError if it does not exist."""
     return motion_model(motion_name) in KERNELS

@@ -1,10 +1,11 @@
-"""Components by name: cards that come with rsbench, a user's card, or an installed package's entry point.
+"""Loading components by name: cards that come with rsbench, users' cards, and entry points of installed packages.
 
-All kinds of components are found in the same way. A name is that of a card, of an entry point, or of a class of
-rsbench that needs no card; a value that ends in ``.toml`` is the path of a card, and ``FILE.py`` or
-``FILE.py:NAME`` a class or decorated function of that file, with its default parameters. A card has ``class =
-"package.module:Class"``, may have ``description``, ``parameters`` and the options of its kind. A name that two
-packages claim is an error only when that name is used; an exception of a package becomes one line with its name.
+All kinds of components are found in the same way. A name refers to a card, an entry point, or a class of rsbench
+that needs no card. A value that ends in ``.toml`` is the path of a card; ``FILE.py`` or ``FILE.py:NAME`` is a
+class or decorated function in that file, used with its default parameters. A card has ``class =
+"package.module:Class"`` and may have ``description``, ``parameters`` and the options of its kind. If two packages
+use the same name, this is an error only when the name is used. An exception in a package's code is reported as one
+line with the package's name.
 """
 
 from __future__ import annotations
@@ -49,11 +50,11 @@ from rsbench.core.errors import RsbenchError
 Component = TypeVar("Component")
 Options = TypeVar("Options")
 MARK = "rsbench_class"
-"""Attribute of a function that is a component: the class that calls it."""
+"""Attribute of a decorated function with the component class that calls it."""
 CARD_OPTIONS = "card_options"
-"""Attribute of a class with its defaults for further keys of a card, if any."""
+"""Attribute of a component class with its defaults for the options of a card, if any."""
 _PYTHON = re.compile(r"(.*\.py)(?::(.*))?", re.DOTALL)
-"""A Python file, and the name of something in it."""
+"""A Python file, optionally followed by the name of a class or function in it."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class RunOptions:
     """Options of running a component, set by its card."""
 
     time_limit_s: float = 300.0
-    """Wall-clock time for one problem, after which a component of another package has failed."""
+    """Wall-clock time limit for one problem; a component of another package that exceeds it has failed."""
 
     def __post_init__(self) -> None:
         if not self.time_limit_s > 0.0:
@@ -94,7 +95,7 @@ class Kind(Generic[Component, Options]):
     built_in: Mapping[str, str] = field(default_factory=dict)
     """Names of rsbench's own classes that need no card, as ``package.module:Class``."""
     check: Callable[[Component], None] = _anything_goes
-    """Raises ValueError for a component whose declarations are inconsistent."""
+    """Function that raises ValueError for a component with inconsistent declarations."""
     mark: str = ""
     """The decorator of functions, such as ``@rsbench.solver``; empty if components must be classes."""
 
@@ -104,7 +105,7 @@ class Kind(Generic[Component, Options]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Entry(Generic[Component, Options]):
-    """A component under the name that tables, files and seeds use."""
+    """A component with its name in tables, files and seeds."""
 
     name: str
     path: Path | None
@@ -115,12 +116,11 @@ class Entry(Generic[Component, Options]):
     parameters: dict[str, Any] = field(default_factory=dict)
     """Parameters that the card sets."""
     key: str
-    """Hash of class, source, parameters and the components inside: equal keys give equal answers."""
+    """Hash of class, source, parameters and inner components: equal keys give equal results."""
 
     @property
     def built_in(self) -> bool:
-        """Whether its class and those of the components inside are rsbench's own, so that it runs in this
-        process."""
+        """Whether the component and its inner components belong to rsbench, so that it runs in this process."""
         part: object = self.component
         while part is not None:
             if type(part).__module__.partition(".")[0] != "rsbench":
@@ -131,11 +131,11 @@ class Entry(Generic[Component, Options]):
 
 @dataclass(frozen=True, kw_only=True)
 class Offer:
-    """A name that is available; nothing is loaded yet."""
+    """An available component that is not yet loaded."""
 
     name: str
     origin: str
-    """``rsbench``, or the package that claims the name."""
+    """``rsbench``, or the package that provides the component."""
     path: Path | None = None
     """Its card."""
     point: metadata.EntryPoint | None = None
@@ -158,10 +158,10 @@ _OWN = tuple(each.name.rstrip("_") for each in dataclasses.fields(CardContent))
 
 
 def blame(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> AbstractContextManager[None]:
-    """Run a component's code: an exception of another package's becomes one line with the component's name.
+    """Return a context for a component's code that reports exceptions of other packages as one line with its name.
 
     Raises:
-        RsbenchError: kind, name and exception. Errors in rsbench's own components are not changed.
+        RsbenchError: an exception in another package's component; exceptions in rsbench's own pass unchanged.
     """
     if entry.built_in:
         return contextlib.nullcontext()
@@ -169,7 +169,7 @@ def blame(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> AbstractContextManage
 
 
 def wrap(kind: Kind[Component, Options], component: Component) -> Entry[Component, Options]:
-    """The entry of a component that was made without a card, named after its class."""
+    """Return the entry of a component object without a card, with the name of its class."""
     return _without_card(kind, component, type(component).__name__, "")
 
 
@@ -187,12 +187,12 @@ def _without_card(
 
 
 def list_names(kind: Kind[Any, Any]) -> list[str]:
-    """Names of all components of a kind, sorted; equal names are no error here."""
+    """Return the names of all components of a kind, sorted; a name that is used twice is not an error here."""
     return sorted({offer.name for offer in offers(kind)})
 
 
 def offers(kind: Kind[Any, Any]) -> list[Offer]:
-    """All available names of a kind, sorted; equal names are an error only when used. Loads nothing."""
+    """Return all available components of a kind, sorted by name, without loading them; names may occur twice."""
     cards = list_cards(kind.cards) if kind.cards is not None else {}
     own = [Offer(name=name, origin="rsbench", path=path) for name, path in cards.items()]
     own += [Offer(name=name, origin="rsbench") for name in kind.built_in if name not in cards]
@@ -205,16 +205,16 @@ def offers(kind: Kind[Any, Any]) -> list[Offer]:
 
 
 def is_path(text: str) -> bool:
-    """Whether a component is given by the path of its card or Python file, not by its name."""
+    """Return whether a component is given by the path of its card or Python file, not by its name."""
     return text.endswith(".toml") or "/" in text or os.sep in text or _PYTHON.fullmatch(text) is not None
 
 
 def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entry[Component, Options]:
-    """A component by the name of a card or entry point, by the path of a card, or by ``FILE.py[:NAME]``.
+    """Load a component by the name of a card or entry point, by the path of a card, or by ``FILE.py[:NAME]``.
 
     Raises:
-        RsbenchError: no such component, two of that name, or its card or class is wrong: one line that names
-            the card, the file or the entry point.
+        RsbenchError: the component does not exist, two have this name, or its card or class is invalid; one line
+            with the card, the file or the entry point.
     """
     text = os.fspath(name_or_path)
     if kind.cards is not None and (python := _PYTHON.fullmatch(text)):
@@ -230,11 +230,12 @@ def load_entry(kind: Kind[Component, Options], name_or_path: str | Path) -> Entr
 
 
 def load_class(kind: Kind[Component, Any], name: str, card: Path | None = None) -> type[Component]:
-    """The class that a card names: by the name of a class of rsbench's own or of an entry point, or as
-    ``package.module:Class``, where the module may lie beside the card (without one, in the current folder).
+    """Load a class by the name of a class of rsbench or of an entry point, or as ``package.module:Class``.
+
+    The module may be in the folder of the card (or, without a card, in the current folder).
 
     Raises:
-        RsbenchError: no such class, two of that name, or it cannot be loaded or is not of this kind.
+        RsbenchError: the class does not exist, two have this name, or it cannot be loaded or is not of this kind.
     """
     card_is = f"{card}: " if card is not None else ""
     if ":" in name:
@@ -244,7 +245,7 @@ def load_class(kind: Kind[Component, Any], name: str, card: Path | None = None) 
 
 
 def description_of(kind: Kind[Any, Any], offer: Offer) -> str:
-    """First paragraph of the docstring of the class of a name without a card.
+    """Return the first paragraph of the docstring of a component's class, for a component without a card.
 
     Raises:
         RsbenchError: two components have this name, it cannot be loaded, or it is not of this kind.
@@ -271,7 +272,7 @@ def _only_offer(kind: Kind[Any, Any], name: str, advice: str, where: str = "") -
 
 
 def _offered_class(kind: Kind[Component, Any], offer: Offer) -> tuple[type[Component], str]:
-    """The class of a name without a card, and its name for messages."""
+    """Load the class of a component without a card; return it with its name for messages."""
     if offer.point is None:
         return _checked(kind, import_target(kind.built_in[offer.name], None, offer.name), offer.name), offer.name
     where = f"entry point {kind.group}:{offer.name} ({_owner(offer)})"
@@ -312,7 +313,7 @@ def _from_card(kind: Kind[Component, Options], path: Path) -> Entry[Component, O
 
 
 def _from_python(kind: Kind[Component, Options], text: str, file: str, name: str) -> Entry[Component, Options]:
-    """The only component of a Python file, named like the file, or the one of that name."""
+    """Load the component with this name from a Python file or, without a name, the only component in it."""
     module = import_file(Path(file))
     offered = {
         cls: key
@@ -334,7 +335,7 @@ def _from_python(kind: Kind[Component, Options], text: str, file: str, name: str
 
 
 def class_of(value: object) -> object:
-    """The class of a decorated function; anything else is returned unchanged."""
+    """Return the component class of a decorated function, and any other value unchanged."""
     return getattr(value, MARK, value) if inspect.isfunction(value) else value
 
 
@@ -343,7 +344,7 @@ def _belongs(kind: Kind[Any, Any], cls: object) -> TypeGuard[type[Any]]:
 
 
 def _remedy(kind: Kind[Any, Any], module: object) -> str:
-    """Remedy for a Python file that defines no component of a kind."""
+    """Return advice for a Python file that defines no component of this kind."""
     own = [each for each in vars(module).values() if inspect.isfunction(each)]
     own = [each for each in own if each.__module__ == getattr(module, "__name__", "")]
     likely = max(own, key=lambda each: len(inspect.signature(each).parameters) == 3, default=None)
@@ -379,16 +380,16 @@ def _checked(kind: Kind[Component, Any], cls: object, where: str) -> type[Compon
 def make_component(
     kind: Kind[Component, Any], cls: type[Component], parameters: Mapping[str, Any], where: str
 ) -> Component:
-    """An object of the class with the parameters of a card.
+    """Make a component of a class with the parameters of a card.
 
     Args:
-        kind: whose ``check`` it must pass.
+        kind: kind of the component, whose ``check`` it must pass.
         cls: a dataclass, whose fields are checked strictly, or any class.
-        parameters: by name.
+        parameters: parameters by name.
         where: card or entry point, for messages.
 
     Raises:
-        RsbenchError: an unknown or wrong parameter, or whatever the class raises: one line.
+        RsbenchError: a parameter is unknown or invalid, or the class raises an exception; one line.
     """
     check_values(parameters, f"{where}: parameters")
     if _has_dataclass_init(cls):
@@ -406,7 +407,7 @@ def make_component(
 
 
 def _has_dataclass_init(cls: type) -> bool:
-    """Whether the constructor is the one that ``@dataclass`` writes, for this class or a base class."""
+    """Return whether the constructor is generated by ``@dataclass``, for this class or a base class."""
     owner = next(parent for parent in cls.__mro__ if "__init__" in vars(parent))
     params = vars(owner).get("__dataclass_params__")
     return params is not None and bool(params.init)

@@ -134,10 +134,10 @@ def rig_of_tables(
     right_from_left: RightFromLeft,
     sizes: Mapping[Side, Size] | None = None,
 ) -> StereoRig:
-    """The rig that these tables describe; ``sizes`` (width, height) are those of the frames, where known.
+    """Make the rig from its tables; ``sizes`` gives (width, height) of the frames, if known.
 
     Raises:
-        ValueError: one line with the table and what is wrong.
+        ValueError: one line with the table and the problem.
     """
     cameras = []
     for side, table in zip(SIDES, (left, right), strict=True):
@@ -152,13 +152,13 @@ def rig_of_tables(
 
 
 def with_readouts(table: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """A rig's table; keys of ``[left]`` and ``[right]`` about the readout become those of ``StatedShutter``.
+    """Convert readout keys of ``[left]`` and ``[right]`` in a rig's table to those of ``StatedShutter``.
 
-    ``readout_ratio``, ``shutter`` and ``scan`` of the rig are those of both cameras, unless a camera has its own;
-    ``delay_s`` of the right camera less that of the left one becomes ``right_delay``, in frame periods.
+    ``readout_ratio``, ``shutter`` and ``scan`` of the rig apply to both cameras, unless a camera has its own
+    value. The difference of the cameras' ``delay_s``, right minus left, becomes ``right_delay``, in frame periods.
 
     Raises:
-        RsbenchError: one line with ``where``, the key and what is wrong.
+        RsbenchError: one line with ``where``, the key and the problem.
     """
     made = with_shutter(table, where)
     cameras = {side: dict(made[side]) for side in SIDES if isinstance(made.get(side), dict)}
@@ -189,7 +189,7 @@ def with_readouts(table: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _ratio_of_lines(camera: dict[str, Any], rig: Mapping[str, Any], where: str) -> float:
-    """Readout ratio of a camera's ``line_delay_s``, which goes; RsbenchError where that cannot be."""
+    """Return the readout ratio from ``line_delay_s``, removing it from the table; may raise RsbenchError."""
     delay, period = camera.pop("line_delay_s"), rig.get("frame_period_s")
     count = camera.get("height" if camera.get("scan", rig.get("scan")) in (None, "top", "bottom") else "width")
     numbers = [each for each in (delay, period, count) if isinstance(each, int | float)]
@@ -203,7 +203,7 @@ def _ratio_of_lines(camera: dict[str, Any], rig: Mapping[str, Any], where: str) 
         raise RsbenchError(
             f"{where}: line_delay_s = {delay}: {count} lines would take {ratio:.4g} frame periods, and 1 is most"
         )
-    return round(min(ratio, 1.0), 12)  # without rounding, which would make two cameras differ
+    return round(min(ratio, 1.0), 12)  # rounded, so that rounding errors do not make two cameras differ
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,23 +221,23 @@ class RigTables(StatedShutter):
     right: CameraTable
     """The right camera; above or below the left one in a vertical rig."""
     right_from_left: RightFromLeft
-    """Where the right camera is, and how it is turned."""
+    """Position and orientation of the right camera relative to the left one."""
     frame_period_s: float | None = None
-    """Seconds from one frame to the next, where the rig has one rate."""
+    """Seconds from one frame to the next, if known for the rig."""
 
     def __post_init__(self) -> None:
         self.rig()
 
     def rig(self) -> StereoRig:
-        """The rig; ValueError as of ``rig_of_tables``."""
+        """Make the rig; may raise ValueError, see ``rig_of_tables``."""
         return rig_of_tables(self.left, self.right, self.right_from_left)
 
 
 def read_rig_table(name_or_path: str) -> dict[str, Any]:
-    """The tables of a rig card, by name or path, as ``RigTables`` takes them.
+    """Read the tables of a rig card, given by name or path, in the form that ``RigTables`` takes.
 
     Raises:
-        RsbenchError: no such card, or a wrong one.
+        RsbenchError: the card does not exist or is invalid.
     """
     path = card_path("rigs", name_or_path)
     table = with_readouts(read_toml(path), str(path))
@@ -246,7 +246,7 @@ def read_rig_table(name_or_path: str) -> dict[str, Any]:
 
 
 def load_rig(name_or_path: str) -> RigTables:
-    """A rig card by name or path; RsbenchError as of ``read_rig_table``."""
+    """Load a rig card by name or path; may raise RsbenchError, see ``read_rig_table``."""
     return parse_card(RigTables, read_rig_table(name_or_path), str(card_path("rigs", name_or_path)))
 
 
@@ -262,10 +262,11 @@ RIG_KEY = {
 
 
 def with_rig(table: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """A table of a card whose rig, a name or tables of its own, becomes the table ``rig`` of ``RigTables``.
+    """Replace the rig in a table of a card, given by name or by tables, by a table ``rig`` for ``RigTables``.
 
     Raises:
-        RsbenchError: both are given, no such rig card, a scale without a rig, or as ``with_readouts``.
+        RsbenchError: both are given, the rig card does not exist, there is a scale without a rig, or see
+            ``with_readouts``.
     """
     made = {key: value for key, value in table.items() if key not in RIG_KEY}
     own = {key: table[key] for key in RIG_KEY if key in table}
@@ -291,9 +292,9 @@ def with_rig(table: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def resized(camera: Any, scale: float) -> Any:
-    """The table of a camera whose images are scaled, to whole sizes; anything else than such a table as it is.
+    """Return a camera's table for scaled images, whose size is rounded; return anything else unchanged.
 
-    The outer borders of the image stay: a pixel at x goes to (x + 1/2) s - 1/2.
+    The outer borders of the image are kept: a pixel at x moves to (x + 1/2) s - 1/2.
     """
     if not isinstance(camera, dict) or any(not isinstance(camera.get(key), int | float) for key in _OF_IMAGE):
         return camera
@@ -306,7 +307,7 @@ def resized(camera: Any, scale: float) -> Any:
 
 
 def tables_of(rig: StereoRig) -> dict[str, Any]:
-    """``left``, ``right`` and ``right_from_left`` of a rig, as rig.toml and manifests have them."""
+    """Return the tables ``left``, ``right`` and ``right_from_left`` of a rig, for rig.toml and manifests."""
     R, t = rig.right_from_left
     return {
         **{side: camera_record(rig.sensor(side)) for side in SIDES},
@@ -315,6 +316,6 @@ def tables_of(rig: StereoRig) -> dict[str, Any]:
 
 
 def camera_record(camera: PinholeCamera) -> dict[str, Any]:
-    """A camera for JSON: size and intrinsics, px, and its lens where it has one."""
+    """Return a camera for JSON: size and intrinsics, px, and its lens if it has one."""
     own: dict[str, Any] = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     return own if camera.lens is None else own | {"lens": camera.lens.record()}

@@ -1,8 +1,8 @@
 """Checks of the arguments of public constructors and functions: types, finite numbers, sizes, names and paths.
 
-Every message is one line with the name, the value and what is allowed. Numbers are Python's or NumPy's own
-integers and floats: no truth values, no complex numbers, no text, no arrays of objects. Checks of rigs and
-images are in ``rsbench.core.geometry``.
+Every message is one line with the name, the value and the allowed values. Numbers are integers and floats of
+Python or NumPy; bools, complex numbers, text and object arrays are rejected. Checks of rigs and images are in
+``rsbench.core.geometry``.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from numpy.typing import ArrayLike
 from rsbench.core.so3 import FloatArray
 
 LARGEST = 1e60
-"""Beyond it products of a few numbers overflow: no length, angle or coefficient is as large."""
+"""Largest accepted number: products of a few larger ones overflow; no length or angle is as large."""
 LARGEST_SIZE = 1_000_000
-"""Rows or columns of an image: ten times the largest stitched ones."""
+"""Largest number of rows or columns of an image: ten times that of the largest stitched images."""
 LARGEST_PX = 1e9
-"""Focal lengths and principal points, in pixels."""
+"""Largest focal length or coordinate of a principal point, in pixels."""
 LARGEST_M = 1e9
-"""Lengths, in metres: beyond the moon."""
+"""Largest length, in metres: more than the distance to the moon."""
 _REAL = "iuf"
 
 
 def check_one_of(name: str, value: object, allowed: Collection[object]) -> None:
-    """Raises ValueError unless ``value`` is one of ``allowed``."""
+    """Raise ValueError unless ``value`` is one of ``allowed``."""
     if not isinstance(value, str | int | float | None) or value not in allowed:
         raise ValueError(f"{name} = {shown(value)}: must be one of {', '.join(map(repr, allowed))}")
 
 
 def check_number(name: str, value: object, least: float = -LARGEST, most: float = LARGEST) -> None:
-    """Raises ValueError unless ``value`` is a finite number from ``least`` to ``most``."""
+    """Raise ValueError unless ``value`` is a finite number from ``least`` to ``most``."""
     if not (is_number(value) and least <= _plain(value) <= most):
         if least <= -LARGEST and most >= LARGEST:
             allowed = "that is finite"
@@ -50,15 +50,16 @@ def check_number(name: str, value: object, least: float = -LARGEST, most: float 
 
 
 def check_positive(name: str, value: object, most: float, unit: str) -> None:
-    """Raises ValueError unless ``value`` is a number above 0 and not above ``most``."""
+    """Raise ValueError unless ``value`` is a number above 0 and not above ``most``."""
     if not (is_number(value) and 0.0 < _plain(value) <= most):
         raise ValueError(f"{name} = {shown(value)}: must be a positive number of {unit}, at most {most:g}")
 
 
 def keep_plain(record: object) -> None:
-    """Replace NumPy's scalars in the fields of a checked dataclass by Python's numbers.
+    """Replace NumPy scalars in the fields of a checked dataclass by Python numbers.
 
-    Arithmetic with a short one overflows or rounds: a focal length of float16 times a baseline of float16 does.
+    Arithmetic with short NumPy types overflows or rounds, for example a float16 focal length times a float16
+    baseline.
     """
     for field in fields(record):  # pyrefly: ignore[bad-argument-type]
         value = getattr(record, field.name)
@@ -67,7 +68,7 @@ def keep_plain(record: object) -> None:
 
 
 def check_whole(name: str, value: object, least: int, most: float = math.inf) -> None:
-    """Raises ValueError unless ``value`` is a whole number from ``least`` to ``most``."""
+    """Raise ValueError unless ``value`` is a whole number from ``least`` to ``most``."""
     whole = isinstance(value, int | np.integer) and is_number(value)
     if not whole or not least <= int(value) <= most:
         allowed = f"of at least {least}" if math.isinf(most) else f"from {least} to {most}"
@@ -75,19 +76,22 @@ def check_whole(name: str, value: object, least: int, most: float = math.inf) ->
 
 
 def check_type(name: str, value: object, wanted: type) -> None:
-    """Raises ValueError unless ``value`` is of the type."""
+    """Raise ValueError unless ``value`` is an instance of ``wanted``."""
     if not isinstance(value, wanted):
         raise ValueError(f"{name}: must be an rsbench {wanted.__name__}, got {shown(value)}")
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether it is one real number, finite or not; NumPy takes spans of time for integers."""
+    """Return whether the value is a single real number, finite or not.
+
+    ``np.timedelta64`` is excluded explicitly, because NumPy derives it from its integers.
+    """
     wrong = isinstance(value, bool | np.timedelta64)
     return isinstance(value, int | float | np.integer | np.floating) and not wrong
 
 
 def _plain(value: float) -> float:
-    """The value as Python's float: NumPy's short floats overflow where they are compared with large numbers."""
+    """Convert to a Python float, because comparing a short NumPy float with a large number overflows."""
     try:
         return float(value)
     except OverflowError:  # a whole number of hundreds of digits
@@ -95,7 +99,7 @@ def _plain(value: float) -> float:
 
 
 def real_array(name: str, value: ArrayLike) -> FloatArray:
-    """A copy as float64; raises ValueError unless it is an array of real numbers, finite or not, none masked."""
+    """Return a float64 copy; raise ValueError unless it is an unmasked array of real numbers, finite or not."""
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError(f"{name} must not be a masked array: give what counts, or NaN where that is allowed")
     if isinstance(value, np.ndarray) and value.dtype == np.float64:
@@ -113,7 +117,7 @@ def real_array(name: str, value: ArrayLike) -> FloatArray:
 
 
 def vector(name: str, value: ArrayLike) -> FloatArray:
-    """Three finite numbers (3,) as a read-only copy; raises ValueError on anything else."""
+    """Return a read-only copy of three finite numbers (3,); raise ValueError for anything else."""
     try:
         v = real_array(name, value)
     except ValueError as error:
@@ -125,7 +129,7 @@ def vector(name: str, value: ArrayLike) -> FloatArray:
 
 
 def shown(value: object) -> str:
-    """The value in one short line."""
+    """Return the value as one short line of text."""
     if isinstance(value, np.ndarray) and value.size > 4:
         return f"an array of {value.dtype} {value.shape}"
     text = _SHORT.repr(value) if not isinstance(value, np.generic) else str(value)
@@ -140,7 +144,7 @@ _LONGEST_PATH = 4096
 
 
 def check_ranges(component: object, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """Raises ValueError unless the numbers of these names lie from the first to the second; None may be."""
+    """Raise ValueError unless each named attribute is within its range (least, most) or is None."""
     for name, (least, most) in ranges.items():
         value = getattr(component, name)
         if value is not None and not least <= value <= most:
@@ -148,7 +152,7 @@ def check_ranges(component: object, ranges: Mapping[str, tuple[float, float]]) -
 
 
 def world_points(points: ArrayLike) -> FloatArray:
-    """Points (..., 3) as float64; raises ValueError on another shape, and on numbers that no scene has."""
+    """Return points (..., 3) as float64; ValueError for another shape or values beyond ``LARGEST_M``."""
     array = real_array("points", points)
     if array.ndim == 0 or array.shape[-1] != 3:
         raise ValueError(f"points: must have shape (..., 3), got {array.shape}")
@@ -159,7 +163,7 @@ def world_points(points: ArrayLike) -> FloatArray:
 
 
 def items(name: str, value: Any) -> Any:
-    """The value; raises ValueError unless it has a length and can be indexed, and on a text."""
+    """Return the value; raise ValueError unless it is a sequence or an array, but not text."""
     listed = isinstance(value, Sequence) and not isinstance(value, str)
     if not listed and not (isinstance(value, np.ndarray) and value.ndim > 0):
         raise ValueError(f"{name}: must be a list, got {shown(value)}")
@@ -167,12 +171,12 @@ def items(name: str, value: Any) -> Any:
 
 
 def path(name: str, value: Any) -> Path:
-    """A path; raises ValueError on what is none, or is longer than a system takes."""
+    """Return a path; raise ValueError if the value is not one or is too long."""
     return Path(name_or_path(name, value))
 
 
 def name_or_path(name: str, value: Any) -> str | Path:
-    """The name of a component or the path of its card; raises ValueError on what is neither."""
+    """Return the name of a component or the path of its card; raise ValueError if the value is neither."""
     text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
     if not isinstance(text, str) or "\0" in text or not 0 < len(text) <= _LONGEST_PATH:
         raise ValueError(f"{name} = {shown(value)}: must be a name or a path")
@@ -180,7 +184,7 @@ def name_or_path(name: str, value: Any) -> str | Path:
 
 
 def names(name: str, value: Any) -> tuple[str, ...]:
-    """One name or many; raises ValueError on anything else."""
+    """Return one name or several as a tuple; raise ValueError for anything else."""
     found = (value,) if isinstance(value, str) else value
     if not isinstance(found, Iterable) or isinstance(found, Mapping):
         raise ValueError(f"{name}: must be names, got {shown(value)}")

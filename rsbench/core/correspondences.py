@@ -1,4 +1,4 @@
-"""Point correspondences of a stereo rig over two frames, the input of solvers, and tracks made of them."""
+"""Point correspondences of a stereo rig over two frames, the input of solvers, and joining them to tracks."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from rsbench.core.so3 import FloatArray
 
 BoolArray = NDArray[np.bool_]
 JOIN_TOLERANCE_PX = 0.01
-"""Two ends are one point if neither coordinate differs by more. It is above the rounding of float32 and of printed
-numbers, and below the noise of keypoints and the distance between two of them."""
+"""Two ends are the same keypoint if neither coordinate differs by more. The value is above rounding errors of
+float32 and printed numbers, and below the noise of keypoints and the distance between two of them."""
 BEYOND_PX = float(np.nextafter(JOIN_TOLERANCE_PX, 1.0))
 _TRACK_HALF: dict[Side, list[int]] = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7]}
 SET_COLUMNS = {"left": 4, "right": 4, "stereo_0": 4, "stereo_1": 4, "tracks": 8, "lines": 16}
@@ -28,10 +28,10 @@ def _none(columns: int) -> FloatArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Correspondences:
-    """Matches in pixels of the (distorted) images, one row each; absent sets are empty.
+    """Matches in pixels of the (distorted) images, one per row; missing sets are empty.
 
-    The sets may hold the same points: ``tracks`` are seen in all four images, and their halves may be
-    repeated in the pairwise sets, where ``JOIN_TOLERANCE_PX`` finds them. The order of matches has no meaning.
+    A point may be in several sets: ``tracks`` are seen in all four images, and their halves may also be in the
+    sets of pairs, where they are identified with ``JOIN_TOLERANCE_PX``. The order of matches has no meaning.
     """
 
     left: FloatArray = field(default_factory=lambda: _none(4))
@@ -97,10 +97,10 @@ SET_SIDES: dict[str, tuple[Side, ...]] = {
 
 
 def without_lens(correspondences: Correspondences, rig: StereoRig) -> Correspondences:
-    """The matches in ideal pixels: as the rectified pair ``rig.ideal`` has them.
+    """Convert the matches to ideal pixels, those of the rectified pair ``rig.ideal``.
 
     Raises:
-        ValueError: a match at which a camera shows no ray; names it.
+        ValueError: a match, which the message names, lies at a pixel for which the lens has no ray.
     """
     if rig.rectified:
         return correspondences
@@ -121,7 +121,7 @@ def without_lens(correspondences: Correspondences, rig: StereoRig) -> Correspond
 
 
 def lens_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera | AlignedCamera) -> FloatArray:
-    """Affine frames (n, 4) of pixels of the image from those of ideal pixels; none of none.
+    """Convert affine frames (n, 4) from ideal pixels to pixels of the image; empty input stays empty.
 
     Args:
         left: (n, 4) the matches, in pixels of the image.
@@ -135,7 +135,7 @@ def lens_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera | Al
 def lens_covariance(
     covariance: FloatArray, tracks: FloatArray, camera: PinholeCamera | AlignedCamera
 ) -> FloatArray:
-    """Covariances (n, 3) in pixels of the left image from those in ideal pixels; none of none.
+    """Convert covariances (n, 3) from ideal pixels to pixels of the left image; empty input stays empty.
 
     Args:
         tracks: (n, 8) the tracks, in pixels of the images.
@@ -144,7 +144,7 @@ def lens_covariance(
 
 
 def _turned(covariance: FloatArray, J: FloatArray) -> FloatArray:
-    """Covariances (n, 3) after linear maps (n, 2, 2)."""
+    """Propagate covariances (n, 3) through linear maps (n, 2, 2)."""
     if len(covariance) == 0:
         return covariance
     full = J @ covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2) @ np.swapaxes(J, 1, 2)
@@ -152,7 +152,7 @@ def _turned(covariance: FloatArray, J: FloatArray) -> FloatArray:
 
 
 def _ideal_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera | AlignedCamera) -> FloatArray:
-    """The inverse of ``lens_affine``."""
+    """Convert affine frames from pixels of the image to ideal pixels, the inverse of ``lens_affine``."""
     if len(affine) == 0:
         return affine
     by_0, by_1 = (camera.ideal_by_pixel(left[:, k : k + 2]) for k in (0, 2))
@@ -160,35 +160,35 @@ def _ideal_affine(affine: FloatArray, left: FloatArray, camera: PinholeCamera | 
 
 
 def track_pairs(tracks: FloatArray, side: Side) -> FloatArray:
-    """The matches over time (n, 4) of one camera in tracks (n, 8)."""
+    """Return the matches over time (n, 4) of one camera that are part of tracks (n, 8)."""
     return tracks[:, _TRACK_HALF[side]]
 
 
 def unlinked_pairs(correspondences: Correspondences, side: Side) -> BoolArray:
-    """Mask of the left or right matches that no track repeats; a track has more information than its repeats."""
+    """Return a mask of the left or right matches that are not part of a track, which has more information."""
     return ~repeated(getattr(correspondences, side), track_pairs(correspondences.tracks, side))
 
 
 def temporal_pairs(correspondences: Correspondences, side: Side) -> FloatArray:
-    """All matches over time (n, 4) of one camera: its own, and the halves of tracks that they do not repeat."""
+    """Return all matches over time (n, 4) of one camera, each once: those of tracks, then those in no track."""
     own: FloatArray = getattr(correspondences, side)
     rest = own[unlinked_pairs(correspondences, side)]
     return np.concatenate([track_pairs(correspondences.tracks, side), rest])
 
 
 def repeated(rows: FloatArray, others: FloatArray) -> BoolArray:
-    """Mask (n,) of the matches (n, c) that are also among ``others`` (m, c), within ``JOIN_TOLERANCE_PX``."""
+    """Return a mask (n,) of the rows (n, c) that are also in ``others`` (m, c), within ``JOIN_TOLERANCE_PX``."""
     return np.isfinite(nearest_within(rows, others)[0][:, 0])
 
 
 def nearest_within(points: FloatArray, others: FloatArray, count: int = 1) -> tuple[FloatArray, NDArray[np.int64]]:
-    """The nearest others (m, c) of points (n, c) in which no coordinate differs by more than the tolerance.
+    """Find, for points (n, c), the nearest of ``others`` (m, c) within ``JOIN_TOLERANCE_PX`` in every coordinate.
 
-    Loading SciPy's trees, which could do this, takes longer than a solve.
+    SciPy's trees could do this, but loading them takes longer than a solve.
 
     Returns:
-        Largest difference of a coordinate (n, count) in growing order, infinite where there is none; indices (n,
-        count), of equals the first, 0 where there is none.
+        Distances (n, count), the largest difference of a coordinate, in increasing order, infinite if there is no
+        further neighbour; and indices (n, count), the lowest first for equal distances, 0 if there is none.
     """
     by_first = np.argsort(others[:, 0], kind="stable")
     others = others[by_first]
@@ -215,9 +215,9 @@ def nearest_within(points: FloatArray, others: FloatArray, count: int = 1) -> tu
 
 _STEREO_HALF = {"stereo_0": slice(0, 4), "stereo_1": slice(4, 8)}
 _RIVALS = 8
-"""Most left-right matches at one point that are considered, the nearest first."""
+"""Largest number of left-right matches at one point that are considered, the nearest first."""
 _SAME_PX = 0.1 * JOIN_TOLERANCE_PX
-"""Smallest difference that decides between rivals; smaller ones are rounding."""
+"""Distances and coordinates are rounded to this unit before candidates are compared, px."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -225,25 +225,25 @@ class Joined:
     """The result of ``join_stereo``."""
 
     correspondences: Correspondences
-    """The given sets; joined tracks follow the given ones."""
+    """The given sets, with joined tracks after the given ones."""
     alone: dict[str, int]
-    """How many matches in ``stereo_0`` and ``stereo_1`` are part of no track."""
+    """Number of matches in ``stereo_0`` and ``stereo_1`` that are not part of a track."""
 
     @property
     def note(self) -> str:
-        """One line about the left-right matches that are part of no track; empty when there are none."""
+        """One-line message about left-right matches that are not part of a track; empty if there are none."""
         sets = {name: len(getattr(self.correspondences, name)) for name in self.alone}
         parts = [f"{self.alone[name]} of {sets[name]} {name}" for name in sets if self.alone[name]]
         return f"{' and '.join(parts)} matches join no match over time: they were not used" if parts else ""
 
 
 def join_stereo(correspondences: Correspondences) -> Joined:
-    """Make tracks of the matches over time that have a left-right match at both ends.
+    """Make tracks from matches over time that have a left-right match at both ends.
 
-    Ends are one point when neither coordinate differs by more than ``JOIN_TOLERANCE_PX``. A match is part of at
-    most one track; of several candidates the nearest are joined, whatever their order, first for left, then for
-    right matches. A track has the ends of its match over time, and the other camera's ends of its left-right
-    matches.
+    Ends are the same keypoint if neither coordinate differs by more than ``JOIN_TOLERANCE_PX``. A match is part of
+    at most one track. The nearest candidates are joined first, independent of the order of the input; left matches
+    are joined before right ones. A track consists of the ends of its match over time and, for the other camera,
+    those of its left-right matches.
     """
     c = correspondences
     for side in SIDES:
@@ -259,7 +259,7 @@ def join_stereo(correspondences: Correspondences) -> Joined:
 
 
 def _joined_tracks(c: Correspondences, side: Side) -> FloatArray:
-    """Tracks (k, 8) from the matches of one camera that are in no track yet, in the order of those matches."""
+    """Return tracks (k, 8) from the matches of one camera that are not in a track yet, in their order."""
     pairs: FloatArray = getattr(c, side)[unlinked_pairs(c, side)]
     stereo = []
     for name, half in _STEREO_HALF.items():
@@ -277,7 +277,11 @@ def _joined_tracks(c: Correspondences, side: Side) -> FloatArray:
 
 
 def _assign(pairs: FloatArray, stereo_0: FloatArray, stereo_1: FloatArray) -> NDArray[np.int64]:
-    """Indices (k, 3) of the pairs (n, 4) and of the matches (m, 4) with the same first ends, each used once."""
+    """Match both ends of pairs (n, 4) with first ends of left-right matches (m, 4) of frames 0 and 1, each used
+    once.
+
+    Return the indices (k, 3) of pair, match of frame 0 and match of frame 1.
+    """
     distance_0, nearest_0 = nearest_within(pairs[:, :2], stereo_0[:, :2], _RIVALS)
     distance_1, nearest_1 = nearest_within(pairs[:, 2:], stereo_1[:, :2], _RIVALS)
     distance = distance_0[:, :, None] + distance_1[:, None, :]
@@ -296,20 +300,20 @@ def _assign(pairs: FloatArray, stereo_0: FloatArray, stereo_1: FloatArray) -> ND
 
 
 def gyro_samples(samples: ArrayLike | None) -> FloatArray | None:
-    """Samples (n, 4) as ``Correspondences`` has them; raises ValueError as it does."""
+    """Check gyroscope samples (n, 4) like ``Correspondences``, which may raise ValueError; None stays None."""
     return None if samples is None else Correspondences(gyro=arguments.real_array("gyro", samples)).gyro
 
 
 FRAME_1: dict[Side, slice] = {"left": slice(4, 6), "right": slice(6, 8)}
-"""Columns of a track that hold its pixel in frame 1."""
+"""Columns of a track with its pixel in frame 1, by camera."""
 
 
 def with_depth(tracks: FloatArray) -> FloatArray:
-    """Tracks (m, 8) with a positive disparity in frame 0, of (n, 8)."""
+    """Return the tracks (m, 8) among (n, 8) that have a positive disparity in frame 0."""
     return tracks[tracks[:, 0] - tracks[:, 2] > 0.0]
 
 
 def stereo_points(tracks: FloatArray, rig: StereoRig) -> FloatArray:
-    """Points (n, 3), metres, of tracks (n, 8) with depth, in the body at the time of their row in frame 0."""
+    """Triangulate tracks (n, 8) with depth: points (n, 3), metres, in the body at their time in frame 0."""
     depth = rig.depth(tracks[:, 0] - tracks[:, 2])
     return depth[:, None] * rig.camera.unproject(tracks[:, :2]) - rig.offset("left")

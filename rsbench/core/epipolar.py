@@ -1,4 +1,4 @@
-"""Epipolar algebra of a pair of rows of one moving rolling-shutter camera.
+"""Epipolar geometry between two rows of one moving rolling-shutter camera.
 
 Row ``y0`` of frame 0 and row ``y1`` of frame 1 of the same camera form an ordinary two-view pair with
 R = R(tau1) R(tau0)^T and T = t(tau1) - R t(tau0) (paper, eq. 6, without its linearisation), so
@@ -21,22 +21,23 @@ from rsbench.core.so3 import FloatArray, hat
 
 
 def essential_matrix(pose: Pose) -> FloatArray:
-    """E (..., 3, 3) with ``x1^T E x0 = 0`` of ``cam1_from_cam0``."""
+    """Return E (..., 3, 3), with ``x1^T E x0 = 0``, for the pose ``cam1_from_cam0``."""
     return hat(pose.t) @ pose.R
 
 
 def row_pair_pose(
     rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, y0: ArrayLike, y1: ArrayLike
 ) -> Pose:
-    """Pose of the camera at row ``y1`` of frame 1 from the camera at row ``y0`` of frame 0, batch (...).
+    """Return the pose from the camera at row ``y0`` of frame 0 to the camera at row ``y1`` of frame 1, batch
+    (...).
 
-    Here and below in the body's axes, as the rays of ``rig.eye`` are.
+    Poses here and below are in the body's axes, like the rays of ``rig.eye``.
     """
     return _pose_between(rig, motion, side, shutter.row_time(y0, 0), shutter.row_time(y1, 1))
 
 
 def match_pose(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, matches: FloatArray) -> Pose:
-    """The same between the times at which a camera reads both ends of matches (n, 4), of any shutter."""
+    """Return the relative poses between the times at which a camera reads the two ends of matches (n, 4)."""
     ends = (shutter.pixel_time(matches[:, 2 * frame : 2 * frame + 2], frame, side) for frame in FRAMES)
     return _pose_between(rig, motion, side, *ends)
 
@@ -49,7 +50,7 @@ def _pose_between(rig: StereoRig, motion: Motion, side: Side, tau0: FloatArray, 
 
 
 def epipolar_gradient(E: FloatArray, x0: FloatArray, x1: FloatArray, camera: PinholeCamera) -> FloatArray:
-    """Derivative (..., 4) of ``x1^T E x0`` by the pixels (x0, y0, x1, y1); rays (..., 3) with z = 1."""
+    """Return the derivative (..., 4) of ``x1^T E x0`` by pixels (x0, y0, x1, y1); rays (..., 3) have z = 1."""
     line0 = (np.swapaxes(E, -1, -2) @ x1[..., None])[..., :2, 0]
     line1 = (E @ x0[..., None])[..., :2, 0]
     focal = np.array([camera.fx, camera.fy])
@@ -59,10 +60,9 @@ def epipolar_gradient(E: FloatArray, x0: FloatArray, x1: FloatArray, camera: Pin
 def rs_constraint(
     rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, matches: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """``x1^T E x0`` (n,) of matches (n, 4) x0, y0, x1, y1 and its total derivative (n, 4) by these pixels.
+    """Return ``x1^T E x0`` (n,) for matches (n, 4) x0, y0, x1, y1 and its total derivative (n, 4) by these pixels.
 
-    Pixels are those of the image, distorted by its lens. The derivative counts that a shifted row is also read at
-    another time.
+    Pixels are those of the distorted image. The derivative includes that a shifted pixel is read at another time.
     """
     eye = rig.eye(side)
     x0, x1 = eye.unproject(matches[:, :2]), eye.unproject(matches[:, 2:])
@@ -85,7 +85,7 @@ def rs_constraint(
 
 
 def _by_pixels(gradient: FloatArray, camera: PinholeCamera | AlignedCamera, matches: FloatArray) -> FloatArray:
-    """Derivatives (n, ..., 4) by the pixels of matches (n, 4) from those by the pixels of an ideal camera."""
+    """Convert derivatives (n, ..., 4) by ideal pixels to derivatives by the pixels of matches (n, 4)."""
     if camera.is_ideal:
         return gradient
     L = [camera.ideal_by_pixel(matches[:, columns]) for columns in (slice(0, 2), slice(2, 4))]
@@ -96,10 +96,10 @@ def _by_pixels(gradient: FloatArray, camera: PinholeCamera | AlignedCamera, matc
 def rs_sampson_error(
     rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, matches: FloatArray
 ) -> FloatArray:
-    """Exact rolling-shutter Sampson error in pixels (n,) of matches (n, 4): x0, y0, x1, y1.
+    """Return the exact rolling-shutter Sampson error (n,), px, of matches (n, 4) x0, y0, x1, y1.
 
-    The distance to the nearest exact match, to first order; its sign is that of the constraint. Zero where both
-    the constraint and its gradient vanish. Hartley & Zisserman, 2nd ed., eq. 11.9.
+    It is the distance to the nearest exact match, to first order, with the sign of the constraint. It is zero if
+    the gradient of the constraint vanishes. Hartley & Zisserman, 2nd ed., eq. 11.9.
     """
     value, gradient = rs_constraint(rig, shutter, motion, side, matches)
     norm = np.linalg.norm(gradient, axis=-1)
@@ -111,9 +111,9 @@ def _apply(R: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def ray_depths(pose: Pose, x0: FloatArray, x1: FloatArray) -> FloatArray:
-    """Depths (..., 2) along the rays ``x0``, ``x1`` (..., 3) of the closest points of the two rays.
+    """Return the depths (..., 2) along rays ``x0``, ``x1`` (..., 3) at which the two rays are closest.
 
-    Solves ``z1 x1 = z0 R x0 + T`` in least squares; a depth is meaningless (NaN) for parallel rays.
+    They are the least-squares solution of ``z1 x1 = z0 R x0 + T``, and NaN for parallel rays.
     """
     p = _apply(pose.R, x0)
     pp, yy, py = np.sum(p * p, axis=-1), np.sum(x1 * x1, axis=-1), np.sum(p * x1, axis=-1)
@@ -124,6 +124,6 @@ def ray_depths(pose: Pose, x0: FloatArray, x1: FloatArray) -> FloatArray:
 
 
 def in_front(pose: Pose, x0: FloatArray, x1: FloatArray) -> np.ndarray:
-    """Cheirality: whether both depths are positive, (...) bool; parallel rays count as not."""
+    """Return whether both depths are positive (cheirality), (...) bool; False for parallel rays."""
     depths = ray_depths(pose, x0, x1)
     return np.all(np.where(np.isfinite(depths), depths, -1.0) > 0.0, axis=-1)

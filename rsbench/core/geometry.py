@@ -1,9 +1,8 @@
-"""A moving rig as one object: cameras, shutter and motion, with the rigid objects that it passes.
+"""A moving rig as one object (cameras, shutter and motion), and rigid moving objects in the scene.
 
-The frame of an object is the world as it is at time 0: a point of the object is at ``X`` then, and at
-``world_from_object(tau) X`` later. Seen from this frame the object stands still and the rig moves as
-``RelativeMotion`` says, so everything that holds for points that stand still (rows that see them, depth, flow)
-holds for points of the object too.
+The frame of an object coincides with the world at time 0: a point of the object is at ``X`` then, and at
+``world_from_object(tau) X`` later. In this frame the object stands still and the rig moves by ``RelativeMotion``.
+Everything that holds for static points (rows that see them, depth, flow) therefore holds for points of the object.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class MovingRig(Protocol):
 
 
 class Geometry(MovingRig, Protocol):
-    """A moving rig and the objects that it passes, which may move by themselves; a ``Sequence`` is one."""
+    """A moving rig and the moving objects in its scene; a ``Sequence`` is one."""
 
     @property
     def frames(self) -> int: ...
@@ -45,44 +44,48 @@ class Geometry(MovingRig, Protocol):
 
 
 class FixedGeometry(NamedTuple):
-    """A ``Geometry`` that is no sequence."""
+    """A ``Geometry`` given by its parts, without a sequence."""
 
     rig: StereoRig
     shutter: RollingShutter
     motion: Motion
     frames: int = len(FRAMES)
     objects: tuple[MovingObject, ...] = ()
-    """Objects that move by themselves, in the order of their numbers from 1."""
+    """Moving objects, in the order of their numbers, which start at 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class MovingObject:
-    """A rigid body: R(tau), t(tau) of its motion turn it about its pivot and shift it."""
+    """A rigid body that its motion rotates about a pivot, R(tau), and translates, t(tau)."""
 
     pivot: FloatArray
     """(3,) metres, world frame at time 0."""
     motion: Motion
-    """Not of the rig: ``X(tau) = pivot + R(tau) (X - pivot) + t(tau)``."""
+    """Motion of the object: ``X(tau) = pivot + R(tau) (X - pivot) + t(tau)``."""
 
     def world_from_object(self, tau: ArrayLike) -> Pose:
-        """Pose (..., 3, 3), (..., 3) at times (...); the identity at 0."""
+        """Return the pose (..., 3, 3), (..., 3) at times (...); it is the identity at 0."""
         R, t = self.motion.body_from_world(tau)
         return Pose(R, t + self.pivot - R @ self.pivot)
 
     def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Velocities of ``world_from_object``, as ``Motion.velocity``."""
+        """Return the velocities of ``world_from_object``, as ``Motion.velocity`` does."""
         R, _ = self.motion.body_from_world(tau)
         w_rate, t_rate = self.motion.velocity(tau)
         return w_rate, t_rate - so3.cross(w_rate, R @ self.pivot)
 
     def from_time(self, start: float, body: Pose) -> MovingObject:
-        """The same seen from a later time, which is its time 0, in the world that is the rig's ``body`` then."""
+        """Return the same object with time 0 at ``start`` and, as world frame, the rig's ``body`` at that time."""
         motion = TurnedMotion(self.motion.from_time(start), body.R)
         return MovingObject(body.R @ self.pivot + body.t, motion)
 
 
 def poses_of(objects: Sequence[MovingObject], tau: ArrayLike) -> Pose | None:
-    """``world_from_object`` (objects, ..., 3, 3), (objects, ..., 3) at times (...); None where there are none."""
+    """Return ``world_from_object`` of all objects at times (...): (objects, ..., 3, 3), (objects, ..., 3); or
+    None.
+
+    It is None if there are no objects.
+    """
     if not objects:
         return None
     poses = [each.world_from_object(tau) for each in objects]
@@ -92,12 +95,12 @@ def poses_of(objects: Sequence[MovingObject], tau: ArrayLike) -> Pose | None:
 @final
 @dataclass(frozen=True, eq=False, init=False)
 class TurnedMotion(Motion):
-    """Another motion in turned axes: R(tau) and t(tau) become ``A R A^T`` and ``A t``."""
+    """A motion expressed in rotated axes: R(tau) and t(tau) become ``A R A^T`` and ``A t``."""
 
     name: ClassVar[str] = "turned"
     motion: Motion
     axes: FloatArray
-    """A (3, 3): turned from the axes of ``motion``."""
+    """The rotation A (3, 3) from the axes of ``motion`` to the new axes."""
 
     def __init__(self, motion: Motion, axes: FloatArray) -> None:
         super().__init__(axes @ motion.w, axes @ motion.d)
@@ -116,7 +119,7 @@ class TurnedMotion(Motion):
 @final
 @dataclass(frozen=True, eq=False, init=False)
 class RelativeMotion(Motion):
-    """The rig's motion seen from a moving object: ``body_from_object``."""
+    """The rig's motion relative to a moving object: ``body_from_object``."""
 
     name: ClassVar[str] = "relative"
     rig: Motion
@@ -145,18 +148,18 @@ _IMAGE_TYPES = (np.dtype(np.uint8), np.dtype(np.uint16))
 
 
 def check_times(readout_ratio: float | None, target_row: float, rig: StereoRig) -> None:
-    """Raises ValueError unless the ratio (None: unknown) and the row of an image are in their ranges."""
+    """Raise ValueError unless the readout ratio (None: unknown) and the row of an image are in range."""
     if readout_ratio is not None:
         arguments.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
     arguments.check_number("target_row", target_row, 0.0, rig.camera.height - 1.0)
 
 
 UNALIGNED = "the rig's cameras differ or look in different directions"
-"""Why a part that takes the ideal rig alone refuses another."""
+"""Reason given by components that support only the ideal rig."""
 
 
 def check_ideal(rig: StereoRig, what: str) -> None:
-    """Raises RsbenchError where cameras have a lens or are not aligned, which ``what`` does not take."""
+    """Raise RsbenchError if the cameras have a lens or are not aligned, which ``what`` does not support."""
     if not rig.aligned:
         raise RsbenchError(f"{UNALIGNED}: {what} takes two equal cameras in perfect alignment")
     if rig.camera.lens is not None:
@@ -166,7 +169,7 @@ def check_ideal(rig: StereoRig, what: str) -> None:
 
 
 def check_plain(rig: StereoRig, shutter: RollingShutter, what: str) -> None:
-    """Raises RsbenchError for cameras with a lens or another scan, which ``what`` does not take."""
+    """Raise RsbenchError unless the rig is ideal and reads rows from the top at the same times, for ``what``."""
     check_ideal(rig, what)
     if not shutter.plain:
         s = shutter.scanning
@@ -178,7 +181,7 @@ def check_plain(rig: StereoRig, shutter: RollingShutter, what: str) -> None:
 
 
 def check_cameras_of(cameras: str, rig: StereoRig, shutter: RollingShutter, what: str) -> None:
-    """Raises RsbenchError for cameras that a part which declares ``cameras`` (ideal, any, rig) does not take."""
+    """Raise RsbenchError for a rig outside the declared support ``cameras`` (ideal, any, rig) of a component."""
     if cameras == "ideal":
         check_plain(rig, shutter, what)
     elif cameras == "any" and not rig.aligned:
@@ -186,25 +189,25 @@ def check_cameras_of(cameras: str, rig: StereoRig, shutter: RollingShutter, what
 
 
 def check_view(side: str, frame: int) -> None:
-    """Raises ValueError unless the side exists and the frame may exist."""
+    """Raise ValueError unless the side exists and the frame is a plausible number."""
     arguments.check_one_of("side", side, SIDES)
     arguments.check_whole("frame", frame, 0, arguments.LARGEST_SIZE)
 
 
 def check_motion(rig: StereoRig, motion: Motion) -> None:
-    """Raises ValueError unless ``rig`` is a rig and ``motion`` a motion."""
+    """Raise ValueError unless ``rig`` is a rig and ``motion`` a motion."""
     arguments.check_type("rig", rig, StereoRig)
     arguments.check_type("motion", motion, Motion)
 
 
 def check_moving_rig(rig: StereoRig, shutter: RollingShutter, motion: Motion) -> None:
-    """Raises ValueError on arguments of another type, and on a shutter of another size than the cameras."""
+    """Raise ValueError if an argument has the wrong type, or the shutter and the cameras differ in size."""
     check_rows(rig, shutter)
     check_motion(rig, motion)
 
 
 def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
-    """Raises ValueError unless the shutter reads as many rows and columns as the cameras have."""
+    """Raise ValueError unless the shutter has as many rows, or columns, as each camera."""
     arguments.check_type("rig", rig, StereoRig)
     arguments.check_type("shutter", shutter, RollingShutter)
     for side in SIDES:
@@ -218,10 +221,11 @@ def check_rows(rig: StereoRig, shutter: RollingShutter) -> None:
 
 
 def four_images(images: Sequence[NDArray[Any]], rig: StereoRig | None = None) -> dict[View, NDArray[Any]]:
-    """Images left 0, right 0, left 1, right 1 by side and frame.
+    """Return the images left 0, right 0, left 1, right 1 as a mapping from side and frame.
 
     Raises:
-        ValueError: not four, not uint8 or uint16, not alike, or not of the size of the rig's cameras.
+        ValueError: there are not four, or they are not uint8 or uint16, differ in shape or type, or do not have
+            the size of the rig's cameras.
     """
     if len(arguments.items("images", images)) != 4:
         raise ValueError(f"images: got {len(images)}; four are needed: left 0, right 0, left 1, right 1")
@@ -238,7 +242,7 @@ def four_images(images: Sequence[NDArray[Any]], rig: StereoRig | None = None) ->
 
 
 def check_image(name: str, image: NDArray[Any], rig: StereoRig | None, side: Side = "left") -> NDArray[Any]:
-    """The image; raises ValueError unless it is (H, W) or (H, W, 3), uint8 or uint16, of the cameras' size."""
+    """Return the image; ValueError unless it is (H, W) or (H, W, 3), uint8 or uint16, of the camera's size."""
     if not isinstance(image, np.ndarray) or image.dtype not in _IMAGE_TYPES:
         kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
         raise ValueError(f"{name}: must be an array of uint8 or uint16, got {kind}")

@@ -1,4 +1,4 @@
-"""Inertial sensors: the motion that a gyroscope's samples give, and what an ideal sensor measures of a motion.
+"""Inertial sensors: motion from gyroscope samples, and ideal measurements of gyroscope and accelerometer.
 
 The sensor stands at the body's origin with the body's axes: x right, y down, z forward.
 """
@@ -21,14 +21,14 @@ from rsbench.core.so3 import FloatArray
 @final
 @dataclass(frozen=True, eq=False, init=False)
 class GyroMotion(Motion):
-    """Rotation integrated from samples (n, 4), t(tau) = tau d; d may change, the samples stay."""
+    """Motion with the rotation integrated from samples (n, 4) of a gyroscope, and t(tau) = tau d."""
 
     name: ClassVar[str] = "gyro"
     samples: FloatArray
     nodes: FloatArray
-    """(n, 3, 3) rotations at the samples, since the first of them."""
+    """(n, 3, 3) rotations from the first sample to each sample."""
     origin: FloatArray
-    """(3, 3) the inverse of that at time 0."""
+    """(3, 3) inverse of the rotation from the first sample to time 0."""
 
     def __init__(self, samples: FloatArray, d: ArrayLike) -> None:
         samples = samples[np.lexsort(samples.T[::-1])]
@@ -43,7 +43,7 @@ class GyroMotion(Motion):
         super().__init__(so3.log(self._turned(np.ones(())) @ self.origin), d)
 
     def _turned(self, tau: FloatArray) -> FloatArray:
-        """Rotation (..., 3, 3) since the first sample; rates are linear between samples, and constant beyond."""
+        """Return rotations (..., 3, 3) since the first sample; rates are linear between samples, else constant."""
         times, rates = self.samples[:, 0], self.samples[:, 1:]
         k = np.clip(np.searchsorted(times, tau, side="right") - 1, 0, len(times) - 2)
         s = (tau - times[k])[..., None]
@@ -62,7 +62,7 @@ class GyroMotion(Motion):
         return np.stack(rates, axis=-1), np.broadcast_to(self.d, (*tau.shape, 3))
 
     def along(self, d: FloatArray) -> GyroMotion:
-        """The same rotation with another translation."""
+        """Return the motion with the same rotation and another translation."""
         other = copy.copy(self)
         object.__setattr__(other, "d", d)
         return other
@@ -78,20 +78,21 @@ class Inertial(NamedTuple):
     turn: FloatArray
     """Angular velocity of the body, rad/s."""
     force: FloatArray
-    """Specific force, acceleration less gravity, m/s^2: at rest it points up."""
+    """Specific force, i.e. acceleration minus gravity, m/s^2; at rest it points up."""
 
 
 def inertial(motion: Motion, tau: ArrayLike, frame_period_s: float, gravity: ArrayLike) -> Inertial:
-    """Ideal measurements at times ``tau`` (...), frame periods.
+    """Return ideal measurements at times ``tau`` (...), frame periods.
 
-    With u = t' - w' x t the body's origin moves in the world by p' = -R^T u, and so p'' = R^T (w' x u - u').
-    ``Motion`` carries points from the world into the body, hence the signs: the body turns by -w'.
+    With u = t' - w' x t, the velocity of the body's origin in the world is p' = -R^T u, and its acceleration is
+    p'' = R^T (w' x u - u'). ``Motion`` maps points from the world to the body, so the body's angular velocity is
+    -w'.
 
     Args:
-        motion: of the body.
+        motion: motion of the body.
         tau: times (...).
-        frame_period_s: seconds of a frame period.
-        gravity: (3,) acceleration of a free fall in the world frame, m/s^2.
+        frame_period_s: duration of a frame period, seconds.
+        gravity: (3,) acceleration of free fall in the world frame, m/s^2.
     """
     R, t = motion.body_from_world(tau)
     w, speed = motion.velocity(tau)

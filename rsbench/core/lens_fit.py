@@ -1,7 +1,7 @@
-"""Fisheye models of other tools that have no counterpart here, as Kannala-Brandt lenses fitted to them.
+"""Kannala-Brandt lenses fitted to fisheye models of other tools that rsbench does not have.
 
-Radially symmetric models are a function from the angle between a ray and the axis to the distorted radius in focal
-lengths. Kannala-Brandt is such a function too, an odd polynomial, so the fit is linear.
+A radially symmetric model is a function from the angle between a ray and the axis to the distorted radius in focal
+lengths. For Kannala-Brandt this function is an odd polynomial, so the fit is linear.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from rsbench.core.camera import WIDEST, Lens, PinholeCamera
 from rsbench.core.so3 import FloatArray
 
 Profile = Callable[[FloatArray], FloatArray]
-"""Distorted radii, in focal lengths, of angles from the axis, rad."""
+"""Function that returns distorted radii, in focal lengths, for angles from the axis, rad."""
 _NODES, _CHECKED = 400, 4001
 
 
 class LensFit(NamedTuple):
-    """A Kannala-Brandt lens in place of another, with the focal lengths that go with it."""
+    """A Kannala-Brandt lens that approximates another lens model, with its focal lengths."""
 
     lens: Lens
     fx: float
     fy: float
     error_px: float
-    """Largest distance between the two models' pixels of a ray, over the angles that the image shows."""
+    """Largest distance between the pixels of a ray in the two models, over the angles within the image."""
 
 
 def kannala_brandt_of(camera: PinholeCamera, profile: Profile) -> LensFit:
@@ -94,27 +94,27 @@ _LEAST_SLOPE, _MOST_ADDED, _WEIGHT = 0.3, 0.15, 0.03
 
 
 class Continued(NamedTuple):
-    """A rational lens in place of one whose polynomial folds just before the corners of the image."""
+    """A rational lens that replaces a lens whose polynomial folds just inside the corners of the image."""
 
     lens: Lens
     until: float
-    """Distorted radius, in focal lengths, from which it is continued."""
+    """Distorted radius, in focal lengths, beyond which the lens is extrapolated."""
     error: float
-    """Largest distance between the two lenses' images of a ray before that, in focal lengths."""
+    """Largest difference between the two lenses' distorted radii within that radius, in focal lengths."""
 
 
 def continued(lens: Lens, corner: float) -> Continued | None:
-    """A lens that does not fold before the corner of the image, which a calibration has seen no points of.
+    """Return a lens that does not fold inside the corners of the image, where a calibration has no points.
 
-    From where the distorted radius grows by less than 0.3 of the ideal one, it goes on growing so; the nearest
-    rational lens is fitted to that, tangential distortion kept.
+    Beyond the radius at which the derivative of the distorted radius falls below 0.3, the lens is extrapolated
+    linearly. A rational lens is fitted to the result; tangential distortion is kept.
 
     Args:
         lens: ``brown-conrady`` or ``rational``.
         corner: distorted radius, in focal lengths, up to which the image reaches.
 
     Returns:
-        None where the lens folds far from the corner, or not at all.
+        The lens, or None if the slope falls below 0.3 far from the corner, or nowhere.
     """
     radial = replace(lens, p1=0.0, p2=0.0)
     r = np.linspace(0.0, min(lens.reach, 1e3) * (1 - 1e-9), _CHECKED)[1:]

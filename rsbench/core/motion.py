@@ -1,8 +1,9 @@
-"""Motion models: where the rig's body is at time tau (frame periods); the body is the world at time 0.
+"""Motion models: the pose of the rig's body at time tau (frame periods), relative to the body at time 0.
 
-All models share the parameters ``w`` and ``d``: the pose after one frame period is R = exp([w]x), t = d, so one
-ground truth scores every model. They differ in how they interpolate, which costs as much accuracy as the
-rolling shutter itself when data and solver disagree: a dataset names its model.
+All models have the parameters ``w`` and ``d``: the pose after one frame period is R = exp([w]x), t = d. The same
+ground truth therefore scores every model. The models differ in their interpolation. If data and solver assume
+different models, the loss of accuracy is as large as that of ignoring the rolling shutter, so a dataset names its
+model.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ from rsbench.core.se3 import Pose, compose, inverse
 from rsbench.core.so3 import FloatArray
 
 _STEP = 1e-3
-"""Frame periods between velocities whose differences are accelerations, for models without exact ones."""
+"""Step of the numerical derivative of the velocity, frame periods, for models without exact accelerations."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Motion(ABC):
     """Rigid motion of the body (the centre of the baseline).
 
-    A model is a frozen dataclass below this one, made as ``Model(w, d, **parameters)``; its fields are its own
-    parameters, which have defaults, so that the name, w and d are enough.
+    A model is a frozen dataclass derived from this class, constructed as ``Model(w, d, **parameters)``. Its fields
+    are its own parameters. These have defaults, so that name, w and d suffice to construct it.
     """
 
     w: FloatArray
@@ -45,17 +46,17 @@ class Motion(ABC):
 
     @abstractmethod
     def body_from_world(self, tau: ArrayLike) -> Pose:
-        """Pose (..., 3, 3), (..., 3) at times ``tau`` (...): the identity at 0, (exp([w]x), d) at 1."""
+        """Return the pose (..., 3, 3), (..., 3) at times ``tau`` (...): the identity at 0, (exp([w]x), d) at 1."""
 
     @abstractmethod
     def velocity(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """``(w', t')`` (..., 3) with dR/dtau = [w']x R and dt/dtau = t'."""
+        """Return ``(w', t')``, (..., 3) each, with dR/dtau = [w']x R and dt/dtau = t'."""
 
     def accelerations(self, tau: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Angular and linear acceleration, (..., 3) each: the derivatives of ``velocity``.
+        """Return angular and linear acceleration, (..., 3) each, the derivatives of ``velocity``.
 
-        Here by central differences of fourth order, which err by 3e-14 (the fourth power of their step, over 30)
-        of the fifth derivative of the velocity; rsbench's own models have exact ones.
+        This default uses fourth-order central differences, whose error is 3e-14 (the fourth power of the step over
+        30) times the fifth derivative of the velocity. rsbench's own models override it with exact derivatives.
         """
         tau = np.asarray(tau, dtype=np.float64)
         weights = {-2.0: 1.0, -1.0: -8.0, 1.0: 8.0, 2.0: -1.0}
@@ -65,55 +66,55 @@ class Motion(ABC):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The model's parameters beside w and d, as in JSON: ``type(m)(m.w, m.d, **m.parameters)`` is m."""
+        """The model's parameters other than w and d, for JSON: ``type(m)(m.w, m.d, **m.parameters)`` equals m."""
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name not in ("w", "d")}
 
     def with_endpoint(self, w: ArrayLike, d: ArrayLike) -> Self:
-        """The same model with the same parameters and another pose after one period."""
+        """Return a motion of the same model with the same parameters and another pose after one period."""
         return type(self)(w, d, **self.parameters)
 
     def fastest(self, first: float, last: float) -> tuple[float, float] | None:
-        """Upper bounds of |w'| and |t'| at times from ``first`` to ``last``; None when they are not known."""
+        """Return upper bounds of |w'| and |t'| from ``first`` to ``last``; None if they are not known."""
         return None
 
     def from_time(self, start: float) -> Motion:
-        """The same motion, seen from the body at time ``start``, which is time 0 of the new one."""
+        """Return the same motion relative to the body at time ``start``, which becomes time 0."""
         return self if start == 0.0 else LaterMotion.of(self, start)
 
     @property
     def lasts(self) -> float:
-        """Until when the model describes the motion, frame periods; the rig then goes on at constant speed."""
+        """Time until which the model describes the motion, frame periods; the velocity is constant after it."""
         return float("inf")
 
     @classmethod
     def lasting(cls, parameters: Mapping[str, Any], periods: float) -> dict[str, Any]:
-        """The parameters, with those added that make the motion last so many periods."""
+        """Return the parameters, with additions that make the motion last this number of periods."""
         return dict(parameters)
 
     @classmethod
     def endpoint(cls, parameters: Mapping[str, Any]) -> tuple[FloatArray, FloatArray] | None:
-        """``(w, d)`` where the parameters alone fix them; None where they are free, as in most models.
+        """Return ``(w, d)`` if the parameters determine them; None if they are free, as in most models.
 
         Raises:
-            ValueError: such parameters are not possible.
+            ValueError: the parameters are invalid.
         """
         return None
 
     @classmethod
     def drawn(cls, parameters: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
-        """The parameters, with those drawn that are random by default; ``rng`` is used for nothing else."""
+        """Return the parameters, with draws for those random by default; ``rng`` has no other use."""
         return dict(parameters)
 
 
 @final
 @dataclass(frozen=True, eq=False, init=False)
 class LaterMotion(Motion):
-    """Another motion from a later time on, as for a pair of frames in the middle of a sequence."""
+    """Another motion, starting at a later time, such as that of a pair of frames in the middle of a sequence."""
 
     name: ClassVar[str] = "later"
     motion: Motion
     start: float
-    """Time of ``motion`` that is time 0 here, frame periods."""
+    """Time of ``motion``, frame periods, that is time 0 of this motion."""
 
     def __init__(self, w: ArrayLike, d: ArrayLike, motion: Motion, start: float) -> None:
         super().__init__(w, d)
@@ -122,7 +123,7 @@ class LaterMotion(Motion):
 
     @classmethod
     def of(cls, motion: Motion, start: float) -> LaterMotion:
-        """With the w and d of the period that begins at ``start``."""
+        """Make the motion, with w and d of the period that begins at ``start``."""
         first, last = (motion.body_from_world(start + period) for period in (0.0, 1.0))
         R, t = compose(last, inverse(first))
         return cls(so3.log(R), t, motion, start)
@@ -145,7 +146,7 @@ class LaterMotion(Motion):
         return turn, change + so3.cross(turn, beside) + so3.cross(w, so3.cross(w, beside))
 
     def _beside(self, tau: ArrayLike) -> FloatArray:
-        """(..., 3) what the new world's origin adds to the body's translation; it turns with the body."""
+        """Return the contribution (..., 3) of the new world's origin to the body's translation."""
         R, _ = self.motion.body_from_world(np.asarray(tau) + self.start)
         return R @ self._world.t
 

@@ -33,7 +33,7 @@ def translation_error(d_est: ArrayLike, d_gt: ArrayLike) -> FloatArray:
 
 
 def scale_error(d_est: ArrayLike, d_gt: ArrayLike) -> FloatArray:
-    """e_s = abs(log(norm(d_est) / norm(d_gt))); infinite when the estimate is zero, NaN when the truth is."""
+    """e_s = abs(log(norm(d_est) / norm(d_gt))); infinite if the estimate is zero, NaN if the truth is zero."""
     (d_est, power_est), (d_gt, power_gt) = _scaled(d_est), _scaled(d_gt)
     est, gt = np.linalg.norm(d_est, axis=-1), np.linalg.norm(d_gt, axis=-1)
     ratio, power = est / np.where(gt > 0.0, gt, 1.0), power_est - power_gt
@@ -45,10 +45,11 @@ def scale_error(d_est: ArrayLike, d_gt: ArrayLike) -> FloatArray:
 
 
 def _scaled(d: ArrayLike) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Vectors (..., 3) over powers of two (...) that bring their largest component into [0.5, 1), and the powers.
+    """Divide vectors (..., 3) by powers of two, so that their largest component is in [0.5, 1); return the
+    exponents.
 
-    Products of the scaled vectors neither overflow nor underflow; where those of the vectors themselves do not
-    either, they differ by the power alone, without rounding. A zero vector stays.
+    Products of the scaled vectors neither overflow nor underflow, and scaling adds no rounding errors. A zero
+    vector is unchanged.
     """
     d = np.asarray(d, dtype=np.float64)
     _, power = np.frexp(np.max(np.abs(d), axis=-1, initial=0.0))
@@ -57,9 +58,10 @@ def _scaled(d: ArrayLike) -> tuple[FloatArray, NDArray[np.int64]]:
 
 
 def translation_of_offset(w: ArrayLike, d: ArrayLike, offset: ArrayLike) -> FloatArray:
-    """Translation (..., 3) over one period of the camera at ``x_cam = x_body + offset``: d + offset - R offset.
+    """Return the translation (..., 3) over one period of a camera at ``x_cam = x_body + offset``: d + offset - R
+    offset.
 
-    This is what a single camera's essential matrix holds, so the mono baseline is scored against it.
+    A single camera's essential matrix depends on this translation, so solvers of one camera are scored against it.
     """
     offset = np.asarray(offset, dtype=np.float64)
     return np.asarray(d, dtype=np.float64) + offset - so3.exp(w) @ offset

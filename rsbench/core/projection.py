@@ -1,9 +1,9 @@
 """Projection of world points into a rolling-shutter frame: the implicit row equation, solved exactly.
 
-A point is seen at row y when its projection at row y's pose falls on row y:
-``f(y) = project(cam_from_world(row_time(y)) X).y - y = 0``. It may have no solution (never seen) or several
-(seen twice, when the image of the point keeps pace with the readout). Rows are those of the image as the lens
-distorts it. Where a camera reads columns, read column for row and x for y.
+A point is seen at row y if its projection with the pose at the time of row y lies on row y:
+``f(y) = project(cam_from_world(row_time(y)) X).y - y = 0``. There may be no solution (the point is never seen) or
+several (it is seen twice, if its image moves along with the readout). Rows are those of the distorted image. For a
+camera that reads columns, replace row by column and y by x.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class ProjectionStatus(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class RSProjection:
-    """Pixels of points in one rolling-shutter frame; batch axes as the points had."""
+    """Pixels of points in one rolling-shutter frame, with the batch axes of the points."""
 
     pixels: FloatArray
     """(..., 2) px; NaN unless the status is SEEN or TWICE."""
@@ -55,13 +55,13 @@ class RSProjection:
 
 
 def project_at(rig: StereoRig, motion: Motion, side: Side, tau: ArrayLike, points: FloatArray) -> FloatArray:
-    """Pixels and depth (..., 3) of world points (..., 3) at given times: a global-shutter projection."""
+    """Return pixels and depth (..., 3) of world points (..., 3) at given times, as for a global shutter."""
     x_in_cam = transform(rig.cam_from_world(motion, tau, side), points)
     return np.concatenate([rig.sensor(side).project(x_in_cam), x_in_cam[..., 2:]], axis=-1)
 
 
 class _RowEquation(NamedTuple):
-    """f(y) of points in one frame: zero where a row sees a point at its own time."""
+    """The row equation f(y) of points in one frame, which is zero if row y sees the point."""
 
     rig: StereoRig
     shutter: RollingShutter
@@ -70,7 +70,11 @@ class _RowEquation(NamedTuple):
     frame: int
 
     def __call__(self, X: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """f (...) in px, f' (...) and the point (..., 3) seen from the camera of rows (...); NaN behind it."""
+        """Return f (...) in px, f' (...) and the points (..., 3) in the camera at rows y (...), in the body's
+        axes.
+
+        f and f' are NaN behind the camera.
+        """
         axis = self.shutter.axis(self.side)
         tau = self.shutter.line_time(y, self.frame, self.side)
         R, t = self.rig.eye_from_world(self.motion, tau, self.side)
@@ -84,16 +88,16 @@ class _RowEquation(NamedTuple):
 
 
 class _Brackets(NamedTuple):
-    """Intervals of rows (low, high), each around one root of the equation of one point; all (m,)."""
+    """Intervals (low, high) of rows, each with one root of the row equation of one point; all (m,)."""
 
     point: NDArray[np.int64]
-    """Number of the point."""
+    """Index of the point."""
     low: FloatArray
     high: FloatArray
 
 
 def _brackets(equation: _RowEquation, X: FloatArray) -> _Brackets:
-    """Every crossing of points (n, 3), the pairs that hide between two samples of one sign included."""
+    """Bracket all roots for points (n, 3), including pairs of roots between two samples with the same sign."""
     grid = np.linspace(-0.5, equation.shutter.lines(equation.side) - 0.5, _COARSE_ROWS)
     samples = [equation(X, np.full(1, y)) for y in grid]
     found = []
@@ -102,7 +106,7 @@ def _brackets(equation: _RowEquation, X: FloatArray) -> _Brackets:
         crosses = ((value0 >= 0.0) & (value1 < 0.0)) | ((value0 < 0.0) & (value1 >= 0.0))
         index = np.flatnonzero(crosses)
         found.append(_Brackets(index, np.full(len(index), low), np.full(len(index), high)))
-        # Same sign at both ends while the slopes point at zero: the extremum between may lie beyond zero.
+        # If both ends have the same sign but slopes towards zero, the extremum between them may be beyond zero.
         sign = np.sign(value0)
         dips = np.flatnonzero((sign * np.sign(value1) > 0) & (slope0 * sign < 0) & (slope1 * sign > 0))
         turn = _extremum(equation, X[dips], low, high, sign[dips])
@@ -114,7 +118,7 @@ def _brackets(equation: _RowEquation, X: FloatArray) -> _Brackets:
 
 
 def _extremum(equation: _RowEquation, X: FloatArray, low: float, high: float, sign: FloatArray) -> FloatArray:
-    """Row (n,) in (low, high) nearest to zero, where the slope changes from towards zero to away from it."""
+    """Find by bisection the row (n,) in (low, high) at which f has its extremum, nearest to zero."""
     a, b = np.full(len(X), low), np.full(len(X), high)
     for _ in range(_MAX_ITERATIONS if len(X) else 0):
         middle = 0.5 * (a + b)
@@ -144,7 +148,7 @@ def rs_project(
         [ProjectionStatus.TWICE, ProjectionStatus.SEEN, ProjectionStatus.NOT_CONVERGED],
         ProjectionStatus.NEVER,
     )
-    # The first row of each point: unique() keeps the first of equal indices, which the sort puts in order.
+    # Select the first row of each point: rows are sorted, and unique() keeps the first of equal indices.
     order = np.lexsort((y, index))
     order = order[inside[order]]
     hit, first = np.unique(index[order], return_index=True)
@@ -169,9 +173,9 @@ def rs_project_near(
     points: ArrayLike,
     start_rows: ArrayLike,
 ) -> RSProjection:
-    """Like ``rs_project`` from a row guess (...) per point, or a column where those are read: for dense maps.
+    """Project like ``rs_project``, starting from a guess (...) of each point's row (or column), for dense maps.
 
-    Newton only; finds one crossing and does not look for others, so the status is never TWICE.
+    Only Newton steps are used. They find one root and do not search for others, so the status is never TWICE.
     """
     X = np.asarray(points, dtype=np.float64)
     y = np.broadcast_to(np.asarray(start_rows, dtype=np.float64), X.shape[:-1]).copy()
@@ -179,7 +183,7 @@ def rs_project_near(
     for _ in range(_MAX_NEWTON_STEPS):
         value, slope, x = equation(X, y)
         converged = np.abs(value) <= ROW_TOLERANCE_PX
-        # Points behind the camera have no residual and need no further steps.
+        # Points behind the camera have no residual (NaN) and need no further steps.
         if np.all(converged | np.isnan(value)):
             break
         y = np.where(converged | np.isnan(value), y, y - value / np.where(slope == 0.0, np.nan, slope))
@@ -198,7 +202,10 @@ def rs_project_near(
 def _solve_rows(
     equation: _RowEquation, X: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Root of the row equation inside (low, high): Newton, replaced by bisection when a step leaves it."""
+    """Solve the row equation in (low, high) by Newton steps, or by bisection if a step leaves the interval.
+
+    Return the rows and whether each has converged.
+    """
     sign_low = np.sign(equation(X, low)[0])
     y = 0.5 * (low + high)
     value, slope, _ = equation(X, y)
@@ -223,7 +230,7 @@ def back_project(
     pixels: ArrayLike,
     depth: ArrayLike,
 ) -> FloatArray:
-    """World points (..., 3) of pixels (..., 2) with depth z (...) in their own row's camera (paper, eq. 11a)."""
+    """Return world points (..., 3) of pixels (..., 2) with depth z (...) at their row (paper, eq. 11a)."""
     p = np.asarray(pixels, dtype=np.float64)
     x_in_cam = np.asarray(depth, dtype=np.float64)[..., None] * rig.sensor(side).unproject(p)
     R, t = rig.cam_from_world(motion, shutter.pixel_time(p, frame, side), side)
@@ -239,9 +246,10 @@ def pixel_moves(
     points: FloatArray,
     along: FloatArray,
 ) -> FloatArray:
-    """Derivative (n, 2, 2) of the pixels that see points (n, 3) at tau (n,), by steps along (n, 3, 2).
+    """Return the derivative (n, 2, 2) of the pixels of points (n, 3), seen at tau (n,), by steps ``along`` (n, 3,
+    2).
 
-    That of the implicit row equation q = proj(pose(time(q)) X): (1 - v r')^-1 J, with J the derivative of the
+    The implicit row equation q = proj(pose(time(q)) X) gives (1 - v r^T)^-1 J, with J the derivative of the
     projection at that time, v the velocity of the pixel and r the derivative of the time by the pixel.
     """
     camera = rig.eye(side)
@@ -255,7 +263,7 @@ def pixel_moves(
 
 
 def plane_basis(normals: FloatArray) -> FloatArray:
-    """(n, 3, 2) two orthonormal vectors on planes with normals (n, 3); any two of a plane without one."""
+    """Return two orthogonal vectors (n, 3, 2) in planes with unit normals (n, 3); 0 for a normal of 0."""
     least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
     first = so3.cross(normals, least)
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), np.finfo(np.float64).tiny)
@@ -263,8 +271,8 @@ def plane_basis(normals: FloatArray) -> FloatArray:
 
 
 def row_poses(rig: StereoRig, shutter: RollingShutter, motion: Motion, side: Side, frame: int) -> Pose:
-    """``cam_from_world`` of every line, (lines, 3, 3) and (lines, 3), for the renderer and the files.
+    """Return ``cam_from_world`` of every line, (lines, 3, 3) and (lines, 3), for renderers and files.
 
-    Lines are rows, or columns where the camera reads those, in the order of the image.
+    Lines are rows from the top or, if the camera reads columns, columns from the left.
     """
     return rig.cam_from_world(motion, shutter.line_times(frame, side), side)

@@ -1,14 +1,15 @@
 """The stereo rig: two cameras fixed to one body, each with its own size, intrinsics, lens and orientation.
 
-The body's axes are those of the rectified pair: x from the left to the right centre of projection, z the mean
-viewing direction made orthogonal to x, y = z x x. A camera then differs from that of a rectified pair by a
-rotation alone, and whatever is derived for rectified pairs (the paper's equations, disparity, epipolar lines)
-holds for any rig in *ideal* pixels: those of ``StereoRig.camera`` without a lens, looking along the body's axes
-from the centre of a camera. In an ideal rig both cameras are that camera.
+The body's axes are those of the rectified pair: x points from the left to the right centre of projection, z is the
+mean viewing direction made orthogonal to x, and y = z x x. Apart from lens and intrinsics, a camera then differs
+from one of a rectified pair only by a rotation. Everything derived for rectified pairs (the paper's equations,
+disparity, epipolar lines) holds for any rig in *ideal* pixels. These belong to ``StereoRig.camera`` without a
+lens, placed at the centre of either camera and aligned with the body's axes. In an ideal rig both cameras equal
+this camera.
 
-Two kinds of axes occur. ``cam_from_world`` and ``sensor`` are in a camera's own axes; files, renderers and
-depth (z in the camera of the line) use them. ``eye`` and ``eye_from_world`` are in the body's axes at the same
-centre; solvers, matching and disparities use them. In an ideal rig both are the same.
+There are two kinds of axes. ``cam_from_world`` and ``sensor`` use a camera's own axes, as do files, renderers and
+depth (z in the camera at the time of the line). ``eye`` and ``eye_from_world`` use the body's axes at the camera's
+centre, as do solvers, matching and disparities. In an ideal rig both are the same.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ SIDES: tuple[Side, Side] = ("left", "right")
 View = tuple[Side, int]
 """Side and frame, from 0."""
 FRAMES = (0, 1)
-"""The frames of a pair; every estimate is of one pair."""
+"""The frames of a pair; every estimate is for one pair."""
 _ALIGNED_RAD = 1e-9
-"""Rotations below this move no pixel by more than rounding: the camera counts as aligned."""
+"""A camera counts as aligned if its rotation is smaller; it then moves no pixel by more than rounding errors."""
 _TOGETHER = 0.04
-"""Readout times between the ends of a match below which it is looked for, and its depth found, on one row."""
+"""Largest time between the two ends of a left-right match, frame periods, to count as read at once."""
 _NEAR = 0.125
-"""Disparity of near things, in widths of the image."""
+"""Disparity of near objects, in image widths."""
 _LEAST_FORWARD = 0.05
-"""Least share of the mean viewing direction that is orthogonal to the baseline."""
+"""Smallest length of the component of the summed viewing directions that is orthogonal to the baseline."""
 
 
 def views_of(frames: int) -> tuple[View, ...]:
-    """Both cameras at so many times, the left one first."""
+    """Return all views of both cameras in this number of frames, those of the left camera first."""
     return tuple(product(SIDES, range(frames)))
 
 
@@ -55,7 +56,7 @@ VIEWS = views_of(len(FRAMES))
 
 @dataclass(frozen=True, kw_only=True)
 class RigCamera:
-    """One camera of a rig that is not ideal."""
+    """One camera of a general (not ideal) rig."""
 
     camera: PinholeCamera
     rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -74,24 +75,25 @@ class RigCamera:
 
 @dataclass(frozen=True)
 class AlignedCamera:
-    """A camera of a rig as seen in the body's axes: ``PinholeCamera``'s methods, for rays along those axes.
+    """A camera of a rig with the methods of ``PinholeCamera``, but with points and rays in the body's axes.
 
-    Pixels are the sensor's. Ideal pixels are those of the rig's ideal camera, which looks along the body's axes.
+    Pixels are those of the sensor. Ideal pixels are those of the rig's ideal camera, which is aligned with the
+    body.
     """
 
     own: RigCamera
     ideal: PinholeCamera
-    """The rig's ideal camera; focal lengths and principal point of ideal pixels."""
+    """The rig's ideal camera, with the focal lengths and principal point of ideal pixels."""
     is_ideal = False
 
     @property
     def width(self) -> int:
-        """Columns of the sensor."""
+        """Number of columns of the sensor."""
         return self.own.camera.width
 
     @property
     def height(self) -> int:
-        """Rows of the sensor."""
+        """Number of rows of the sensor."""
         return self.own.camera.height
 
     def project(self, x_in_eye: ArrayLike) -> FloatArray:
@@ -104,16 +106,16 @@ class AlignedCamera:
         return self.own.camera.velocity(np.asarray(x_in_eye) @ R, np.asarray(rates) @ R)
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
-        """Rays (..., 3) with z = 1 in the body's axes; NaN where there is none."""
+        """Return rays (..., 3) of pixels (..., 2), with z = 1 in the body's axes; NaN where undefined."""
         rays = self.own.camera.unproject(pixels) @ self.own.R
         return np.asarray(rays / np.where(rays[..., 2:] > 0.0, rays[..., 2:], np.nan))
 
     def ideal_pixels(self, pixels: ArrayLike) -> FloatArray:
-        """Ideal pixels (..., 2) of pixels (..., 2); NaN where there is none."""
+        """Convert pixels (..., 2) to ideal pixels (..., 2); NaN where undefined."""
         return self.ideal.project(self.unproject(pixels))
 
     def lens_pixels(self, ideal_pixels: ArrayLike) -> FloatArray:
-        """Pixels (..., 2) of ideal pixels (..., 2); NaN where the camera does not look there."""
+        """Convert ideal pixels (..., 2) to pixels (..., 2); NaN outside the camera's view."""
         return self.project(self.ideal.unproject(ideal_pixels))
 
     def ideal_by_pixel(self, pixels: ArrayLike) -> FloatArray:
@@ -139,21 +141,21 @@ class AlignedCamera:
 class StereoRig:
     """A stereo pair that moves about the centre of its baseline.
 
-    ``StereoRig(camera=, baseline=)`` is the ideal rig, two equal cameras in perfect alignment; ``of_cameras``
-    makes any other from what a calibration gives, and ``of_one`` that of one camera.
+    ``StereoRig(camera=, baseline=)`` is the ideal rig of two equal, perfectly aligned cameras. ``of_cameras``
+    makes a rig from a stereo calibration, and ``of_one`` makes one with a single camera.
     """
 
     camera: PinholeCamera
-    """Both cameras of the ideal rig; of any other the ideal camera that ideal pixels belong to, without a lens."""
+    """The camera on both sides of the ideal rig; in other rigs, the camera of ideal pixels, without a lens."""
     baseline: float
     """Full distance between the two cameras, metres (the paper's 2b)."""
     origin: Literal["middle", "left", "right"] = "middle"
-    """The point whose motion is described: the body's, in the middle of the baseline, or one camera's centre."""
+    """The body's origin, whose motion is described: the middle of the baseline, or one camera's centre."""
     left: RigCamera | None = None
-    """None in the ideal rig, as is ``right``."""
+    """The left camera; None in the ideal rig, as is ``right``."""
     right: RigCamera | None = None
     sides: tuple[Side, ...] = field(default=SIDES, repr=False)
-    """The cameras that there are: both, or in a rig ``of_one`` the left one."""
+    """The existing cameras: both, or only the left one in a rig made by ``of_one``."""
 
     def __post_init__(self) -> None:
         arguments.check_type("camera", self.camera, PinholeCamera)
@@ -170,28 +172,30 @@ class StereoRig:
 
     @classmethod
     def of_one(cls, camera: PinholeCamera) -> StereoRig:
-        """One camera, whose centre is the body's: lengths have no unit, so the baseline stands for any."""
+        """Make a rig of one camera, at the body's origin; lengths have no unit, and the baseline is arbitrary."""
         return cls(camera=camera, baseline=1.0, origin="left", sides=("left",))
 
     @classmethod
     def of_cameras(
         cls, left: PinholeCamera, right: PinholeCamera, rotation: ArrayLike, translation: ArrayLike
     ) -> StereoRig:
-        """The rig of two calibrated cameras; the ideal one where they are equal and aligned but for rounding.
+        """Make a rig of two calibrated cameras; it is the ideal rig if they are equal and aligned.
 
         Args:
-            left: intrinsics of the left camera.
-            right: those of the right one.
-            rotation: R (3, 3) of ``X_right = R X_left + t``, as OpenCV's stereoCalibrate and Kalibr's T_cn_cnm1.
+            left: left camera with its intrinsics.
+            right: right camera.
+            rotation: R (3, 3) in ``X_right = R X_left + t``, as in OpenCV's stereoCalibrate and Kalibr's
+                T_cn_cnm1.
             translation: t (3,), metres.
 
         Raises:
-            ValueError: R is no rotation, t is zero, or both cameras look along the line between them.
+            ValueError: R is not a rotation, t is zero, or both cameras look along the baseline or in opposite
+                directions.
         """
         R, t = np.asarray(rotation, dtype=np.float64), arguments.vector("translation", translation)
         if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-4) or np.linalg.det(R) < 0.0:
             raise ValueError("rotation must be a rotation matrix (3, 3)")
-        u, _, vt = np.linalg.svd(R)  # printed matrices have a few digits: the nearest rotation
+        u, _, vt = np.linalg.svd(R)  # use the nearest rotation, as printed matrices are rounded
         R = u @ vt
         baseline = float(np.linalg.norm(t))
         if not baseline > 0.0:
@@ -211,7 +215,7 @@ class StereoRig:
 
     @classmethod
     def of_body(cls, left: RigCamera, right: RigCamera, baseline: float) -> StereoRig:
-        """The rig of cameras ``baseline`` metres apart along the body's x; the ideal one where they are alike."""
+        """Make a rig of cameras ``baseline`` metres apart along x; the ideal rig if they are equal and aligned."""
         turned = max(map(abs, (*left.rotation, *right.rotation)))
         if left.camera == right.camera and turned < _ALIGNED_RAD:
             return cls(camera=left.camera, baseline=baseline)
@@ -219,53 +223,53 @@ class StereoRig:
 
     @property
     def metric(self) -> bool:
-        """Whether lengths are metres; one camera does not show them."""
+        """Whether lengths are in metres; a single camera does not determine them."""
         return len(self.sides) > 1
 
     @property
     def aligned(self) -> bool:
-        """Whether the cameras are equal and look along the body's axes: the ideal rig, with a lens or without."""
+        """Whether this is the ideal rig: equal cameras aligned with the body's axes, with or without a lens."""
         return self.left is None
 
     @property
     def rectified(self) -> bool:
-        """Whether a pixel of the sensor is an ideal one: a match of both cameras is on one row."""
+        """Whether sensor pixels are ideal pixels, so that left-right matches lie on one row."""
         return self.left is None and self.camera.lens is None
 
     def own(self, side: Side) -> RigCamera:
-        """A camera with its rotation."""
+        """Return a camera with its rotation."""
         return (self.left if side == "left" else self.right) or RigCamera(camera=self.camera)
 
     def sensor(self, side: Side) -> PinholeCamera:
-        """A camera in its own axes."""
+        """Return a camera in its own axes."""
         return self.camera if self.left is None else self.own(side).camera
 
     def eye(self, side: Side) -> PinholeCamera | AlignedCamera:
-        """A camera in the body's axes; in the ideal rig the camera itself."""
+        """Return a camera in the body's axes; in the ideal rig, this is the camera itself."""
         return self.camera if self.left is None else AlignedCamera(self.own(side), self.camera)
 
     def offset(self, side: Side) -> FloatArray:
-        """``x_in_eye = x_in_body + offset`` (3,): the camera stands at minus the offset, in the body's axes."""
+        """Return the offset (3,) in ``x_in_eye = x_in_body + offset``; the camera is at minus the offset."""
         place = {"left": self.baseline / 2, "middle": 0.0, "right": -self.baseline / 2}
         return np.array([place[side] - place[self.origin], 0.0, 0.0])
 
     @property
     def right_from_left(self) -> Pose:
-        """``X_right = R X_left + t``, in the cameras' own axes: what calibrations give."""
+        """R and t in ``X_right = R X_left + t``, in the cameras' own axes, as stereo calibrations give them."""
         (left, right), t = (self.own(side).R for side in SIDES), np.array([-self.baseline, 0.0, 0.0])
         return Pose(right @ left.T, right @ t)
 
     @property
     def ideal(self) -> StereoRig:
-        """The rectified rig that sees the same in ideal pixels: equal aligned cameras without a lens."""
+        """The corresponding rectified rig, whose pixels are ideal: equal aligned cameras without a lens."""
         return self if self.rectified else replace(self, camera=self.camera.ideal, left=None, right=None)
 
     def about(self, origin: Literal["middle", "left", "right"]) -> StereoRig:
-        """The same rig whose body is another point of it."""
+        """Return the same rig with another point as the body's origin."""
         return replace(self, origin=origin)
 
     def cam_from_world(self, motion: Motion, tau: ArrayLike, side: Side) -> Pose:
-        """Camera pose (..., 3, 3), (..., 3) at times ``tau`` (...), in the camera's own axes."""
+        """Return the camera pose (..., 3, 3), (..., 3) at times ``tau`` (...), in the camera's own axes."""
         R, t = self.eye_from_world(motion, tau, side)
         if self.left is None:
             return Pose(R, t)
@@ -273,21 +277,22 @@ class StereoRig:
         return Pose(turn @ R, t @ turn.T)
 
     def eye_from_world(self, motion: Motion, tau: ArrayLike, side: Side) -> Pose:
-        """The same in the body's axes."""
+        """Return the camera pose as ``cam_from_world``, but in the body's axes."""
         R, t = motion.body_from_world(tau)
         return Pose(R, t + self.offset(side))
 
     def own_depth(self, side: Side, pixels: ArrayLike) -> FloatArray:
-        """Factors (...) from depth along the body's z, as ``depth`` gives it, to z in the camera's own axes."""
+        """Return factors (...) that convert depth along the body's z to z in the camera's own axes."""
         if self.left is None:
             return np.ones(np.shape(pixels)[:-1])
         return np.asarray(self.eye(side).unproject(pixels) @ self.own(side).R[2])
 
     def rows_together(self, scanning: Scanning, readout_ratio: float | None = None) -> bool:
-        """Whether both ends of a match are read at one time, or nearly: an ideal row of both within a 25th.
+        """Return whether both cameras read an ideal row at nearly the same time, within 0.04 frame periods.
 
-        Of an ideal rig what ``scanning`` says, for its lens bends rows of both cameras alike. A ratio that is not
-        known may be 1: the slower the cameras read, the farther apart are two rows.
+        For an ideal rig this depends on ``scanning`` alone, because its lens bends the rows of both cameras
+        equally.
+        An unknown readout ratio is assumed to be 1, the worst case: times differ more, the slower the readout.
         """
         if self.left is None or not scanning.rows_together:
             return scanning.rows_together
@@ -304,14 +309,14 @@ class StereoRig:
         return bool(np.any(np.isfinite(lag)) and np.nanmax(lag) < _TOGETHER)
 
     def right_by_left(self) -> FloatArray:
-        """Affine map (2, 2) from pixels around the left image's centre to those of the right one, far away."""
+        """Return the linear map (2, 2) from left to right image for distant points near the left centre."""
         left, right = (self.eye(side) for side in SIDES)
         centre = np.array([(left.width - 1) / 2, (left.height - 1) / 2])
         there = right.lens_pixels(left.ideal_pixels(centre))
         return np.asarray(inverse_2x2(right.ideal_by_pixel(there)) @ left.ideal_by_pixel(centre))
 
     def shutter_of(self, scanning: Scanning, readout_ratio: float) -> RollingShutter:
-        """The shutter of these cameras, whose sizes may differ."""
+        """Return the shutter for these cameras, whose sizes may differ."""
         left, right = self.sensor("left"), self.sensor("right")
         same = (left.width, left.height) == (right.width, right.height)
         return scanning.shutter_of(
@@ -319,25 +324,26 @@ class StereoRig:
         )
 
     def depth(self, disparity: ArrayLike) -> FloatArray:
-        """Depth along the body's z (metres) of ``disparity = x_left - x_right`` (ideal px); NaN unless positive.
+        """Return depth along the body's z (metres) for ``disparity = x_left - x_right`` (ideal px); NaN unless >
+        0.
 
-        Exact for a rolling shutter too where both cameras read a point at one time: the pair of a row is then an
-        ordinary rectified pair.
+        This is exact for a rolling shutter too if both cameras read a point at the same time, because the two
+        images of a row are then an ordinary rectified pair.
         """
         disparity = np.asarray(disparity, dtype=np.float64)
         return self.camera.fx * self.baseline / np.where(disparity > 0.0, disparity, np.nan)
 
     def disparity(self, depth: ArrayLike) -> FloatArray:
-        """Disparity (ideal px) of depth along the body's z (metres); NaN where the depth is not positive."""
+        """Return the disparity (ideal px) for depth along the body's z (metres); NaN unless it is positive."""
         depth = np.asarray(depth, dtype=np.float64)
         return self.camera.fx * self.baseline / np.where(depth > 0.0, depth, np.nan)
 
 
 def _ideal_camera(left: RigCamera, right: RigCamera) -> PinholeCamera:
-    """The ideal camera of a rig: mean focal length, centred on what both cameras see, of the left one's size.
+    """Return the ideal camera of a rig: mean focal length, centred on the common view, size of the left camera.
 
-    Where the baseline is vertical in the images, their rows are columns of the rectified pair: width and height
-    are exchanged.
+    If the baseline is vertical in the images, their rows become columns of the rectified pair, so that width and
+    height are exchanged.
     """
     pair = (left, right)
     focal = float(np.mean([f for each in pair for f in each.camera.central_focal]))

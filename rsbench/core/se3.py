@@ -24,13 +24,13 @@ def transform(pose: Pose, x: FloatArray) -> FloatArray:
 
 
 def inverse(pose: Pose) -> Pose:
-    """``source_from_target`` of ``target_from_source``."""
+    """Return the inverse transform, ``source_from_target`` for ``target_from_source``."""
     Rt = np.swapaxes(pose.R, -1, -2)
     return Pose(Rt, -(Rt @ pose.t[..., None])[..., 0])
 
 
 def compose(c_from_b: Pose, b_from_a: Pose) -> Pose:
-    """``c_from_a``."""
+    """Return the product of two transforms, ``c_from_a`` for ``c_from_b`` and ``b_from_a``."""
     return Pose(c_from_b.R @ b_from_a.R, transform(c_from_b, b_from_a.t))
 
 
@@ -42,20 +42,20 @@ def exp(xi: ArrayLike) -> Pose:
 
 
 def log(pose: Pose) -> FloatArray:
-    """Twist (..., 6) of a transform whose rotation is below a half turn."""
+    """Twist (..., 6) of a transform with a rotation below 180 degrees."""
     w = so3.log(pose.R)
     v = np.linalg.solve(so3.left_jacobian(w), pose.t[..., None])[..., 0]
     return np.concatenate([w, v], axis=-1, dtype=np.float64)
 
 
 def adjoint_apply(pose: Pose, xi: FloatArray) -> FloatArray:
-    """Twist (..., 6) of the motion ``xi`` seen after ``pose``: exp(Ad xi) = pose exp(xi) pose^-1."""
+    """Transform a twist (..., 6) by the adjoint of ``pose``: exp(Ad xi) = pose exp(xi) pose^-1."""
     w = (pose.R @ xi[..., :3, None])[..., 0]
     v = (pose.R @ xi[..., 3:, None])[..., 0]
     return np.concatenate([w, v + so3.cross(pose.t, w)], axis=-1)
 
 
 def bracket(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Twist (..., 6) by which ``b`` changes, per unit of time, where the frame moves by the twist ``a``."""
+    """Lie bracket (..., 6) of twists: the rate of change of ``b`` in a frame that moves with twist ``a``."""
     w, v = a[..., :3], a[..., 3:]
     return np.concatenate([so3.cross(w, b[..., :3]), so3.cross(w, b[..., 3:]) + so3.cross(v, b[..., :3])], axis=-1)

@@ -1,4 +1,4 @@
-"""The rolling shutter: the one place that turns a pixel into a time."""
+"""The rolling-shutter model, which alone converts pixels to times."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rsbench.core import arguments
 from rsbench.core.so3 import FloatArray
 
 Scan = Literal["top", "bottom", "left", "right"]
-"""The side of the image at which reading begins: rows from the top or the bottom, or columns."""
+"""Side at which the readout begins; ``top`` and ``bottom`` read rows, ``left`` and ``right`` columns."""
 _LONGEST_DELAY = 1.0
 
 
@@ -31,7 +31,7 @@ class Scanning:
 
     @property
     def record(self) -> dict[str, Any]:
-        """For JSON; newer keys only where they say something."""
+        """Fields for JSON; ``right_readout_ratio``, which older files lack, only if it is set."""
         return {
             name: value
             for name, value in asdict(self).items()
@@ -55,10 +55,11 @@ class Scanning:
     def shutter_of(
         self, width: int, height: int, readout_ratio: float, right_size: tuple[int, int] | None = None
     ) -> RollingShutter:
-        """The shutter of images of this size, and of another (width, height) of the right camera where it differs.
+        """Return the shutter for images of this size; ``right_size`` (width, height) if the right camera's
+        differs.
 
         Raises:
-            ValueError: values that cannot be.
+            ValueError: a value is out of its range.
         """
         columns = {self.scan, self.right_scan} & {"left", "right"}
         ratio = None if self.right_readout_ratio == readout_ratio else self.right_readout_ratio
@@ -76,17 +77,17 @@ class Scanning:
 
 @dataclass(frozen=True, kw_only=True)
 class StatedShutter(Scanning):
-    """What a user states of a shutter; what is left out is estimated from the frames or matches."""
+    """Shutter parameters given by the user; missing ones are estimated from the frames or matches."""
 
     scan: Scan | None = None  # pyrefly: ignore[bad-override]
-    """Side of the image at which the readout of both cameras begins. Absent: found with the readout ratio, or
-    ``top`` where that is given."""
+    """Side of the image at which the readout of both cameras begins. Absent: estimated with the readout ratio, or
+    ``top`` if that is given."""
     readout_ratio: float | None = None
     """Readout time over frame period, 0 to 1. Absent: estimated from the frames."""
 
     @property
     def scanning(self) -> Scanning | None:
-        """How the cameras read their lines; None where that is estimated with the readout ratio."""
+        """How the cameras read their lines; None if this is estimated together with the readout ratio."""
         values = (self.readout_ratio, self.scan, self.right_scan, self.right_readout_ratio)
         if all(value is None for value in values) and self.right_delay == 0.0:
             return None
@@ -100,10 +101,10 @@ class StatedShutter(Scanning):
 
 @dataclass(frozen=True, kw_only=True)
 class RollingShutter(Scanning):
-    """Lines are read evenly within ``readout_ratio`` of a frame period: rows from the top by default.
+    """Rolling shutter that reads lines at constant speed within ``readout_ratio`` of a frame period.
 
-    A line is a row of the image, or a column where a camera reads from the left or the right. Times belong to
-    pixels of the image as the sensor has it, whatever its lens does.
+    A line is a row of the image, or a column if a camera reads from the left or the right. Times depend on pixels
+    of the sensor, before any correction of lens distortion.
     """
 
     height: int
@@ -134,7 +135,7 @@ class RollingShutter(Scanning):
 
     @property
     def plain(self) -> bool:
-        """Whether both cameras read rows from the top at the same times, as ``row_time`` says."""
+        """Whether both cameras read rows from the top at the same times, so that ``row_time`` applies."""
         return super().plain and self.right_size is None
 
     @property
@@ -148,16 +149,16 @@ class RollingShutter(Scanning):
         return self.readout_ratio / self.height
 
     def at_once(self) -> RollingShutter:
-        """A global shutter of the same height: every pixel is read at the start of the frame."""
+        """Return a global shutter of the same height: every pixel is read at the start of the frame."""
         return RollingShutter(height=self.height, readout_ratio=0.0)
 
     def with_ratio(self, readout_ratio: float) -> RollingShutter:
-        """The same shutter with another readout ratio."""
+        """Return the same shutter with another readout ratio."""
         return replace(self, readout_ratio=readout_ratio)
 
     @property
     def scanning(self) -> Scanning:
-        """The part of it that ``Scanning.shutter_of`` takes."""
+        """The fields of ``Scanning`` alone."""
         return Scanning(**{each.name: getattr(self, each.name) for each in fields(Scanning)})
 
     @property
@@ -175,7 +176,7 @@ class RollingShutter(Scanning):
         return self.right_scan if side == "right" and self.right_scan is not None else self.scan
 
     def axis(self, side: str) -> int:
-        """The coordinate that numbers lines: 1, y, for rows; 0, x, for columns."""
+        """Return the index of the pixel coordinate across lines: 1 (y) for rows, 0 (x) for columns."""
         return 1 if self.scan_of(side) in ("top", "bottom") else 0
 
     def lines(self, side: str) -> int:
@@ -186,35 +187,35 @@ class RollingShutter(Scanning):
         return int(size[self.axis(side)] or 0)
 
     def rate(self, side: str) -> FloatArray:
-        """Derivative (2,) of the time by the pixel, frame periods per px."""
+        """Return the derivative (2,) of the time by the pixel, frame periods per px."""
         sign = 1.0 if self.scan_of(side) in ("top", "left") else -1.0
         out = np.zeros(2)
         out[self.axis(side)] = sign * self.ratio_of(side) / self.lines(side)
         return out
 
     def first_line(self, side: str) -> int:
-        """Number of the line that is read first."""
+        """Return the index of the line that is read first."""
         return 0 if self.scan_of(side) in ("top", "left") else self.lines(side) - 1
 
     def line_after(self, count: int, side: str) -> int:
-        """Number of the line that is read when ``count`` lines have been read."""
+        """Return the index of the line that is read after ``count`` other lines."""
         return abs(self.first_line(side) - count)
 
     def start(self, frame: ArrayLike, side: str) -> FloatArray:
-        """Time (...) at which a camera reads the first line of frame ``frame`` (...)."""
+        """Return the time (...) at which a camera reads the first line of frame ``frame`` (...)."""
         late = self.right_delay if side == "right" else 0.0
         return np.asarray(frame, dtype=np.float64) + late
 
     def time_after(self, lines: ArrayLike, frame: ArrayLike, side: str) -> FloatArray:
-        """Time (...) at which a camera has read so many lines (...) of a frame."""
+        """Return the time (...) at which a camera has read this number of lines (...) of a frame."""
         return self.start(frame, side) + self.ratio_of(side) / self.lines(side) * np.asarray(
             lines, dtype=np.float64
         )
 
     def line_time(self, line: ArrayLike, frame: ArrayLike, side: str) -> FloatArray:
-        """Time tau in frame periods at which a camera reads line ``line``, counted from the top or the left.
+        """Return the time tau, in frame periods, at which a camera reads line ``line``, from the top or the left.
 
-        ``line`` is continuous: keypoints use it as it is, rendered lines at the whole number.
+        ``line`` is continuous: keypoints use fractional values, rendered lines whole numbers.
         """
         read = np.asarray(line, dtype=np.float64)
         if self.scan_of(side) in ("bottom", "right"):
@@ -222,21 +223,21 @@ class RollingShutter(Scanning):
         return self.time_after(read, frame, side)
 
     def line_times(self, frame: int, side: str) -> FloatArray:
-        """Times (lines,) of all lines in the order of the image."""
+        """Return the times (lines,) of all lines, from the top or the left."""
         return self.line_time(np.arange(self.lines(side)), frame, side)
 
     def pixel_time(self, pixels: ArrayLike, frame: ArrayLike, side: str) -> FloatArray:
-        """Time (...) at which a camera reads pixels (..., 2)."""
+        """Return the times (...) at which a camera reads pixels (..., 2)."""
         return self.line_time(np.asarray(pixels, dtype=np.float64)[..., self.axis(side)], frame, side)
 
     def row_time(self, y: ArrayLike, frame: ArrayLike) -> FloatArray:
-        """Time tau in frame periods at which both cameras read row ``y`` of frame ``frame``, from the top.
+        """Return the time tau, in frame periods, at which both cameras read row ``y``, from the top, of ``frame``.
 
-        ``y`` is continuous. Row 0 of frame k has tau = k exactly, so the global-shutter truth of a frame is the
-        image at row 0's pose.
+        ``y`` is continuous. Row 0 of frame k has tau = k exactly, so the true global-shutter image of a frame is
+        the image at the pose of row 0.
 
         Raises:
-            ValueError: a shutter that is not ``plain``; ``pixel_time`` knows those.
+            ValueError: the shutter is not ``plain``; use ``pixel_time`` instead.
         """
         if not self.plain:
             raise ValueError(

@@ -1,7 +1,7 @@
-"""Covariances whose 95 % ellipsoids contain the truth: what each stated deviation means.
+"""Covariances of estimates, corrected such that their 95 % ellipsoids contain the truth in 95 % of problems.
 
 An estimate minimises a cost, the sum over measurements i of negative log-likelihoods with gradients g_i and
-curvatures H_i at the minimum. The inverse curvature is too small a covariance for five reasons.
+Hessians H_i at the minimum. The inverse Hessian is too small as a covariance, for five reasons.
 
 1. The model of the noise is approximate. The sandwich A^-1 (sum g_i g_i^T) A^-1 holds whatever the noise is (P.
    Huber, Proc. Fifth Berkeley Symposium, 1967; H. White, Econometrica 1980), with each g_i divided by the root of
@@ -54,31 +54,31 @@ LEVEL = 0.95
 TILES = (4, 3)
 """Columns of the image, and rows in each, in which measurements may have common errors."""
 FEWEST_PER_PARAMETER = 3.0
-"""K over p below which no covariance should be stated: most matches may be wrong without being detected."""
+"""Smallest K / p for which a covariance should be stated; with less, most matches may be undetected outliers."""
 SHIFT_PX, _SHIFT_SHARE = 0.006, 0.1
 """Standard deviation of the shift that the matches of a tile share in one view, pixels, and its largest share of
 the standard deviation of a match. The shift was chosen for the log score of the frames of the track pose-1, whose
 score does not depend on the share; that was chosen on 45 pairs of ``laws`` with seed 7."""
 _LEAST_FREEDOM = 3.0
-"""Least degrees of freedom of the denominator of F: with fewer its quantiles are extreme."""
+"""Lower bound of the degrees of freedom of the denominator of F; with fewer, its quantiles are extreme."""
 _MOST_FOLLOWED = 0.5
-"""Largest leverage for which HC2 corrects."""
+"""Upper bound of leverages in the HC2 correction."""
 _LEAST_LEFT = 1e-3
-"""Least factor r of a shrunk sandwich; below it the degrees of freedom are practically unlimited."""
+"""Lower bound of the factor r of a shrunk sandwich; below it the degrees of freedom are practically unlimited."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stated:
-    """A covariance, and what it was made from."""
+    """A stated covariance and its ingredients."""
 
     covariance: FloatArray
     """(p, p), all factors included."""
     count: float = np.inf
     """K, the effective number of measurements."""
     shared: float = 1.0
-    """Variance that common errors of neighbours leave, over that of independent ones; at least 1."""
+    """Ratio of the variance with common errors of neighbours to that with independent errors; at least 1."""
     shifted: FloatArray | float = 0.0
-    """(p, p) what ``common_shifts`` adds."""
+    """(p, p) contribution of ``common_shifts``."""
 
 
 def stated_covariance(
@@ -91,16 +91,16 @@ def stated_covariance(
     shifts: FloatArray | None = None,
     sigma_px: float = 0.0,
 ) -> Stated:
-    """Points 1 to 4 above, for n measurements and an estimate of size p.
+    """Compute a covariance with corrections 1 to 4 above, for n measurements and an estimate of size p.
 
     Args:
-        gradients: (n, p) g_i, of the cost at its minimum.
+        gradients: (n, p) gradients g_i of the cost at its minimum.
         inverse: (p, p) A^-1, inverse of the cost's Hessian.
         information: (p, p) inverse of the expected information: covariance if the model of the noise holds.
         leverages: (n,) h_i.
         places: (n, 2) position of each measurement in the image, in any unit.
-        parameters: number of them that the measurements determine, p or fewer.
-        shifts: (k, n, p) derivatives of g_i by k kinds of shift by a pixel; None: no point 4.
+        parameters: number of parameters that the measurements determine, p or fewer.
+        shifts: (k, n, p) derivatives of g_i by k kinds of shift, per pixel; None leaves out correction 4.
         sigma_px: standard deviation of a measurement.
     """
     kept = np.sqrt(1.0 - np.minimum(leverages, _MOST_FOLLOWED))
@@ -115,10 +115,10 @@ def stated_covariance(
 
 
 def common_shifts(shares: FloatArray, groups: NDArray[np.int64], sigma_px: float) -> FloatArray:
-    """Covariance (p, p) that shifts common to the measurements of a tile cause, point 4 above.
+    """Return the covariance (p, p) due to shifts common to the measurements of a tile, point 4 above.
 
     Args:
-        shares: (k, n, p) by how much the estimate moves when a measurement is shifted by a pixel, by kind.
+        shares: (k, n, p) change of the estimate per pixel of shift of each measurement, for k kinds of shift.
         groups: (n,) tile of each.
         sigma_px: standard deviation of a measurement.
     """
@@ -130,11 +130,12 @@ def common_shifts(shares: FloatArray, groups: NDArray[np.int64], sigma_px: float
 
 
 def shrunk(shares: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
-    """Covariance (p, p) of a sum of independent shares (n, p), shrunk, and the factor r of their own scatter in
-    it.
+    """Return the shrunk covariance (p, p) of a sum of independent shares (n, p), and the shrinkage factor r.
 
-    Their second moments S, in units in which ``target`` is the identity, are shrunk towards a multiple of it: mu I
-    + r (S - mu I), mu = tr S / p. The factor r minimises the expected squared distance to the truth.
+    In units in which ``target`` is the identity, the second moments S of the shares are shrunk towards a multiple
+    of
+    the identity: mu I + r (S - mu I), mu = tr S / p. The factor r minimises the expected squared distance to the
+    truth.
     """
     size = np.sqrt(np.diagonal(target))
     half = size[:, None] * np.linalg.cholesky(target / np.outer(size, size))
@@ -148,7 +149,10 @@ def shrunk(shares: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
 
 
 def larger(covariance: FloatArray, other: FloatArray) -> FloatArray:
-    """The larger of two covariances (p, p) along each axis on which both are diagonal; ``other``: definite."""
+    """Return the larger of two covariances (p, p) along each axis of their joint diagonalisation.
+
+    ``other`` must be positive definite.
+    """
     size = np.sqrt(np.diagonal(other))
     half = size[:, None] * np.linalg.cholesky(other / np.outer(size, size))
     back = np.linalg.solve(half, np.linalg.solve(half, covariance).T)
@@ -158,14 +162,14 @@ def larger(covariance: FloatArray, other: FloatArray) -> FloatArray:
 
 
 def effective_count(leverages: FloatArray) -> float:
-    """K, the effective number of measurements with leverages (n,); 0 for none."""
+    """Return K, the effective number of measurements with leverages (n,); 0 without measurements."""
     squares = float(np.sum(leverages**2))
     return float(np.sum(leverages)) ** 2 / squares if squares > 0.0 else 0.0
 
 
 @functools.lru_cache(maxsize=4096)
 def small_sample_factor(count: float, parameters: int, level: float = LEVEL) -> float:
-    """Quantile of Hotelling's T^2 for a covariance from K samples over that of chi-squared, at least 1."""
+    """Return the quantile of Hotelling's T^2 for a covariance from K samples, divided by that of chi-squared."""
     freedom = max(float(count) - parameters + 1.0, _LEAST_FREEDOM)
     quantile = float(scipy.special.fdtri(parameters, freedom, level))
     normal = 2.0 * float(scipy.special.gammaincinv(0.5 * parameters, level))
@@ -173,13 +177,13 @@ def small_sample_factor(count: float, parameters: int, level: float = LEVEL) -> 
 
 
 def variance_factor(freedom: float, parameters: int, level: float = LEVEL) -> float:
-    """As ``small_sample_factor`` where one variance alone is estimated, with these degrees of freedom."""
+    """Return ``small_sample_factor`` for the case that one variance is estimated, with this freedom."""
     quantile = float(scipy.special.fdtri(parameters, max(freedom, _LEAST_FREEDOM), level))
     return parameters * quantile / (2.0 * float(scipy.special.gammaincinv(0.5 * parameters, level)))
 
 
 def tiles(places: FloatArray, shape: tuple[int, int] = TILES) -> NDArray[np.int64]:
-    """Number (n,) of the tile of each place (n, 2); columns have equally many places, and so have their rows."""
+    """Return the index (n,) of the tile of each place (n, 2); tiles have (almost) the same number of places."""
     columns, rows = shape
     ranks = np.argsort(np.argsort(places[:, 0], kind="stable"), kind="stable")
     column = ranks * columns // max(len(places), 1)
@@ -192,7 +196,7 @@ def tiles(places: FloatArray, shape: tuple[int, int] = TILES) -> NDArray[np.int6
 
 
 def clustered(shares: FloatArray, groups: NDArray[np.int64]) -> FloatArray:
-    """Covariance (p, p) of a sum of shares (n, p), the shifts that measurements cause, of independent groups."""
+    """Return the covariance (p, p) of the sum of shares (n, p), measurements' effects, with independent groups."""
     _, places = np.unique(groups, return_inverse=True)
     count = int(places.max(initial=-1)) + 1
     if count < 2:
@@ -205,7 +209,7 @@ def clustered(shares: FloatArray, groups: NDArray[np.int64]) -> FloatArray:
 def shared_error_factor(
     shares: FloatArray, groups: NDArray[np.int64], covariance: FloatArray, parameters: int
 ) -> float:
-    """phi, the mean variance of groups that err together over that of a covariance (p, p), at least 1."""
+    """Return phi, the mean ratio of the variance with errors common to groups to a covariance; at least 1."""
     if not shares.size:
         return 1.0
     size = np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
@@ -215,12 +219,12 @@ def shared_error_factor(
 
 
 def tempered(probabilities: ArrayLike, factor: float) -> FloatArray:
-    """Probabilities of hypotheses (k,) after dividing their log-odds by ``factor``."""
+    """Return the probabilities of hypotheses (k,) after dividing their log-odds by ``factor``."""
     powers = np.asarray(probabilities, dtype=np.float64) ** (1.0 / factor)
     return np.asarray(powers / np.sum(powers))
 
 
 def spread_about(used: FloatArray, probabilities: ArrayLike, values: FloatArray) -> FloatArray:
-    """(p, p) mean square of the distance of hypotheses' values (k, p) from the used value (p,)."""
+    """Return the mean outer product (p, p) of deviations of hypotheses' values (k, p) from the one used."""
     away = np.asarray(values) - used
     return np.asarray((np.asarray(probabilities)[:, None] * away).T @ away)

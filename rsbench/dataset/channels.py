@@ -1,7 +1,7 @@
-"""Channels of truth beside images, depth and poses: each is an object that makes, writes and reads its files.
+"""Channels of ground truth besides images, depth and poses: objects that make, write and read their files.
 
-A new channel is a class here and an entry of ``OBJECTS``. ``rsbench verify`` then looks for its files and compares
-rows of it with what rays meet; a check of its own is a row in ``rsbench/verification/checks.py``.
+A new channel needs a class here and an entry of ``OBJECTS``. ``rsbench verify`` then looks for its files and
+compares some rows with ray casting; additional checks are rows in ``rsbench/verification/checks.py``.
 """
 
 from __future__ import annotations
@@ -79,30 +79,30 @@ if TYPE_CHECKING:
     from rsbench.renderers.visibility import Surfaces
 
 PairChannel = Literal["disparity", "flow", "gs_flow"]
-"""Where each pixel of a rolling-shutter frame lies in another picture: of the other camera at the same time
-(disparity), of the same camera at the next time (flow; of the last frame, at the time before), and of its
+"""Displacement of each pixel of a rolling-shutter frame to another image: of the other camera in the same frame
+(disparity), of the same camera in the next frame (flow; from the last frame, to the previous one), or the
 global-shutter twin (gs_flow)."""
 PAIR_CHANNELS: tuple[PairChannel, ...] = get_args(PairChannel)
 INSTANCE_TABLE, TRACKS, AFFINE = "instances.json", "tracks.npz", "affine.npz"
 MATCHER = "matches/matcher.json"
 STEP_PX = 2.0**-10
-"""Values are rounded to multiples of it, which makes the files four times smaller."""
+"""Values are rounded to multiples of this step, px, which makes the files four times smaller."""
 SAME_PX = 1.5 * STEP_PX
-"""A step, where both were rounded, and what rounding of depth and pixels to float32 adds in images of 4000 px."""
+"""Tolerance for equal values, px: one step, as both are rounded, plus float32 rounding in images of 4000 px."""
 _BRIGHTEST = float(np.finfo(np.float16).max)
 
 
 class Layer(NamedTuple):
-    """A channel between two pictures: from each frame to one other picture."""
+    """A channel of displacements from each frame to one other image."""
 
     channel: PairChannel
     row: int = 0
-    """Row of the global-shutter twin to which it leads."""
+    """Row of the target, for a global-shutter twin."""
     back: bool = False
-    """Whether a ``flow`` leads back: from the frames between the first and the last to the frame before."""
+    """Whether a ``flow`` is backward: from the frames between the first and the last to the previous frame."""
 
     def values(self, side: str, frame: int) -> str:
-        """Path of the offsets below the folder of a sequence, like ``mask``, that of their classes."""
+        """Return the path of the offsets below a sequence's folder; ``mask`` returns that of their classes."""
         return f"{self._folder}{self._row}/{side}_{frame}.exr"
 
     def mask(self, side: str, frame: int) -> str:
@@ -117,11 +117,11 @@ class Layer(NamedTuple):
         return f"/{self.row:04d}" if self.row else ""
 
     def views(self, frames: int) -> tuple[View, ...]:
-        """The source views, in a sequence of ``frames`` frames."""
+        """Return the source views in a sequence of ``frames`` frames."""
         return tuple(view for view in views_of(frames) if not self.back or 0 < view[1] < frames - 1)
 
     def target(self, source: ImageView, frames: int) -> ImageView:
-        """The target picture of a source view, in a sequence of ``frames`` frames."""
+        """Return the target image of a source view in a sequence of ``frames`` frames."""
         twin = source.other_shutter._replace(row=self.row)
         over_time = source.frame_before if self.back else source.next_frame(frames)
         return {"disparity": source.other_side, "flow": over_time, "gs_flow": twin}[self.channel]
@@ -142,13 +142,13 @@ class FrameTruth:
     """The data from which the channels of one rolling-shutter frame are computed.
 
     Args:
-        geometry: of the sequence.
+        geometry: geometry of the sequence.
         view: the frame.
-        rendered: its light and depth; of some ``rows``, theirs.
-        rays: through its scene; used by this thread alone.
-        names: of channels that will be made.
-        twins: rows of global-shutter twins to which ``gs_flow`` leads too.
-        rows: these rows of the frame only; all by default.
+        rendered: radiance and depth of the frame, or of its ``rows``.
+        rays: ray casting in the scene; used by this thread only.
+        names: names of the channels to compute.
+        twins: rows of additional global-shutter twins that are targets of ``gs_flow``.
+        rows: rows of the frame to compute; all by default.
         later: starts work in other threads (``background_writer``); by default there are none.
     """
 
@@ -225,12 +225,12 @@ class TruthChannel:
     of_pairs: ClassVar[bool] = False
     """Whether a pair of successive frames (``Sequence.pairs``) keeps it."""
     rounding: ClassVar[float | None] = None
-    """Largest difference between a stored value of a frame and one that rays make again; None: not compared."""
+    """Largest difference between a stored value of a frame and its recomputation by rays; None: not compared."""
 
     def refusal(self, names: Collection[str], lens: bool, plain: bool) -> str:
-        """Why cameras cannot have it beside the channels of these ``names``; "" where they can.
+        """Return why the channel is unavailable for cameras with the channels ``names``, or "" if it is available.
 
-        ``lens``: they have one; ``plain``: both read rows from the top at the same time.
+        ``lens``: the cameras have lenses; ``plain``: both read rows from the top at the same time.
         """
         return ""
 
@@ -242,7 +242,7 @@ class TruthChannel:
         return self.table
 
     def made(self, frame: FrameTruth) -> Iterable[tuple[str, NDArray[Any]]]:
-        """File and values (H, W, ...) of one frame."""
+        """Return files and values (H, W, ...) of one frame."""
         return ()
 
     def write_values(self, path: Path, values: NDArray[Any]) -> None:
@@ -442,15 +442,15 @@ CHANNELS: tuple[Channel, ...] = tuple(OBJECTS)
 
 
 def known(names: Iterable[str]) -> list[TruthChannel]:
-    """The channels of these names, in the order of ``OBJECTS``, without those of later versions."""
+    """Return the channels with these names, in the order of ``OBJECTS``; unknown names are skipped."""
     return [OBJECTS[name] for name in OBJECTS if name in {*names}]
 
 
 def check_channels(names: Collection[str], lens: bool, plain: bool) -> None:
-    """Check whether cameras can have these channels; arguments as of ``TruthChannel.refusal``.
+    """Check whether cameras can have these channels; arguments as for ``TruthChannel.refusal``.
 
     Raises:
-        ValueError: one line with the channel.
+        ValueError: a channel is unavailable; the message is one line.
     """
     for channel in known(names):
         if refusal := channel.refusal(names, lens, plain):
@@ -458,7 +458,7 @@ def check_channels(names: Collection[str], lens: bool, plain: bool) -> None:
 
 
 def channel_files(names: Iterable[str], twins: Iterable[int] = (), frames: int = len(FRAMES)) -> tuple[str, ...]:
-    """Paths below a sequence's folder of the channels of these names; those of later versions have none."""
+    """Return the paths of these channels' files below a sequence's folder; unknown names are skipped."""
     rows = tuple(twins)
     return tuple(file for channel in known(names) for file in channel.files(rows, frames))
 
@@ -475,7 +475,8 @@ def write_channels(
 ) -> None:
     """Write the files of channels that belong to one rolling-shutter frame.
 
-    ``folder`` is that of the sequence; files are written ``later``, the rest as of ``FrameTruth``.
+    ``folder`` is that of the sequence; ``later`` starts the writing of files; other arguments as for
+    ``FrameTruth``.
     """
     frame = FrameTruth(geometry, view, rendered, rays, names, twins, later=later)
     for channel in known(names):
@@ -490,7 +491,7 @@ def write_sequence_channels(names: Sequence[Channel], whole: SequenceTruth) -> N
 
 
 def pair_values(channel: PairChannel, source: ImageView, offset: FloatArray) -> NDArray[np.float32]:
-    """What a channel stores (..., components) of offsets (..., 2), px: a disparity is x_left - x_right."""
+    """Convert offsets (..., 2), px, to stored values (..., components); a disparity is x_left - x_right."""
     if channel == "disparity":
         offset = offset[..., :1] * (1.0 if source.side == "right" else -1.0)
     values = offset / STEP_PX
@@ -500,15 +501,15 @@ def pair_values(channel: PairChannel, source: ImageView, offset: FloatArray) -> 
 
 
 def matches_file(first: int) -> str:
-    """File of the matches of frame ``first`` and the next, below the folder of a sequence."""
+    """Return the path of the matches of frame ``first`` and the next, below the folder of a sequence."""
     return f"matches/{first}.npz"
 
 
 def named_channels(text: str) -> tuple[Channel, ...]:
-    """Channels of a text like "flow,disparity", or of "all" or "none".
+    """Parse a list of channels such as "flow,disparity", or "all" or "none".
 
     Raises:
-        RsbenchError: a name that no channel has, or one twice.
+        RsbenchError: a name is unknown or repeated.
     """
     if text in ("all", "none"):
         return CHANNELS if text == "all" else ()
@@ -539,7 +540,7 @@ class ChannelReader:
     """Content of sequence.json."""
 
     def channel_values(self, channel: str, file: str) -> NDArray[Any]:
-        """(H, W, ...) of a file below the folder, one that the channel has for each frame.
+        """Read values (H, W, ...) from a file of a channel with one file per frame.
 
         Raises:
             RsbenchError: the sequence does not have this channel, or the file cannot be read.
@@ -550,10 +551,10 @@ class ChannelReader:
     def offsets(
         self, channel: PairChannel, side: Side, frame: int, row: int = 0, back: bool = False
     ) -> NDArray[np.float32]:
-        """(H, W, components) px of the pixels of a rolling-shutter frame: see ``channels.PairChannel``.
+        """Read displacements (H, W, components), px, of a rolling-shutter frame's pixels, see ``PairChannel``.
 
-        ``row``: of ``gs_flow``, that of the twin to which it leads: 0, or one of ``twins``. ``back``: of ``flow``,
-        to the frame before, as from the last frame in any case. RsbenchError as of ``channel_values``.
+        ``row`` is that of the target twin of ``gs_flow``: 0, or one of ``twins``. ``back`` selects the ``flow`` to
+        the previous frame, which is the only one from the last frame. RsbenchError as for ``channel_values``.
         """
         return self.channel_values(
             channel, self._layer(channel, frame, row, back).values(side, frame + self.first)
@@ -562,26 +563,26 @@ class ChannelReader:
     def classes(
         self, channel: PairChannel, side: Side, frame: int, row: int = 0, back: bool = False
     ) -> NDArray[np.uint8]:
-        """(H, W) of ``PixelClass``: whether the target picture sees the surface of each pixel.
+        """Read values (H, W) of ``PixelClass``: whether the target image shows the surface of each pixel.
 
-        Arguments and RsbenchError as of ``offsets``.
+        Arguments and RsbenchError as for ``offsets``.
         """
         return self.channel_values(channel, self._layer(channel, frame, row, back).mask(side, frame + self.first))
 
     def normals(self, side: Side, frame: int) -> NDArray[np.float32]:
-        """(H, W, 3) unit normals of what the pixels see, towards the camera, world frame; 0 where that is nothing.
+        """Read the unit normals (H, W, 3) of the pixels' surfaces, towards the camera, world frame; 0 in the sky.
 
-        RsbenchError as of ``channel_values``.
+        RsbenchError as for ``channel_values``.
         """
         return self.channel_values("normals", NORMALS.file(side, frame + self.first))
 
     def instances(self, side: Side, frame: int) -> NDArray[np.uint16]:
-        """(H, W) numbers of the meshes that the pixels see; 0 = none. RsbenchError as of ``channel_values``."""
+        """Read the mesh numbers (H, W) of the pixels; 0 = none. RsbenchError as for ``channel_values``."""
         return self.channel_values("instances", INSTANCES.file(side, frame + self.first))
 
     def instance_table(self) -> list[dict[str, str]]:
-        """``name`` and ``material`` of instance 1, 2, ...; RsbenchError as of ``channel_values``, or another
-        content."""
+        """Read ``name`` and ``material`` of instances 1, 2, ...; RsbenchError as for ``channel_values``, or if the
+        content is invalid."""
         path = self._path("instances", INSTANCE_TABLE)
         table = read_json(path).get("instances")
         rows: list[Any] = table if isinstance(table, list) else [None]
@@ -591,54 +592,54 @@ class ChannelReader:
         return rows
 
     def timing(self) -> dict[str, Any]:
-        """Content of timing.json; RsbenchError as of ``channel_values``."""
+        """Read timing.json; RsbenchError as for ``channel_values``."""
         return read_json(self._path("timing", TIMING_MANIFEST))
 
     def row_times_ns(self, side: Side, frame: int) -> NDArray[np.int64]:
-        """(H, 4) of each row: number, time, start and end of its exposure; RsbenchError likewise."""
+        """Read a table (H, 4) of row, time, start and end of exposure, ns; RsbenchError as for ``timing``."""
         return read_timing_table(self._path("timing", table_file(side, frame)), self.shutter.lines(side))
 
     def inertial(self) -> ImuSamples:
-        """Measured and true inertial samples; RsbenchError as of ``channel_values``."""
+        """Read measured and true inertial samples; RsbenchError as for ``channel_values``."""
         self._path("imu", IMU_MANIFEST)
         return read_imu(self.folder)
 
     def imu_manifest(self) -> dict[str, Any]:
-        """Content of imu.json; RsbenchError as of ``channel_values``."""
+        """Read imu.json; RsbenchError as for ``channel_values``."""
         return read_json(self._path("imu", IMU_MANIFEST))
 
     def radiance(self, side: Side, frame: int) -> NDArray[np.float32]:
-        """(H, W, 3) linear RGB radiance of a rolling-shutter frame without its sensor.
+        """Read the linear RGB radiance (H, W, 3) of a rolling-shutter frame, without effects of the sensor.
 
-        Times the renderer's ``exposure``, 1 is white. Rounded to float16 on disk. RsbenchError as of
-        ``channel_values``.
+        White is 1 after multiplication by the renderer's ``exposure``. Files are rounded to float16. RsbenchError
+        as for ``channel_values``.
         """
         return self.channel_values("hdr", RADIANCE.file(side, frame + self.first))
 
     def tracks(self) -> Tracks:
-        """Surface points and where the frames see them; RsbenchError as of ``channel_values``."""
+        """Read surface points and their pixels in all frames; RsbenchError as for ``channel_values``."""
         found, views = Tracks.read(path := self._path("tracks", TRACKS)), len(SIDES) * self.frames
         if found.tau.shape[1] != views:
             raise RsbenchError(f"{path}: holds {found.tau.shape[1]} views, but the sequence has {views}")
         return found
 
     def affine(self) -> AffineFrames:
-        """Affine frames of the tracks' points; RsbenchError as of ``channel_values``."""
+        """Read the affine frames of the tracks' points; RsbenchError as for ``channel_values``."""
         return AffineFrames.read(self._path("affine", AFFINE))
 
     def matches(self, first: int = 0) -> LabelledMatches:
-        """Matches of a feature matcher between frame ``first`` and the next, with true places and classes.
+        """Read the matches of a feature matcher in frame ``first`` and the next, with true pixels and classes.
 
-        RsbenchError as of ``channel_values``.
+        RsbenchError as for ``channel_values``.
         """
         return LabelledMatches.read(self._path("matches", matches_file(first + self.first)))
 
     def matcher(self) -> dict[str, Any]:
-        """Content of matches/matcher.json: the matcher; RsbenchError as of ``channel_values``."""
+        """Read matches/matcher.json, which describes the matcher; RsbenchError as for ``channel_values``."""
         return read_json(self._path("matches", MATCHER))
 
     def _layer(self, channel: PairChannel, frame: int, row: int, back: bool) -> Layer:
-        """The layer that leads from a frame to the next or to the one before."""
+        """Return the layer from a frame to the next or the previous one."""
         if back and channel in self.channels and (channel != "flow" or frame == 0):
             raise RsbenchError(f"{self.folder}: {channel} of frame {frame} leads to no frame before")
         last = frames_of(self.manifest) - 1

@@ -1,8 +1,8 @@
-"""The channels of clocks, in nanoseconds, of which 0 is row 0 of frame 0.
+"""The channels ``timing`` and ``imu``, with times in nanoseconds since row 0 of frame 0.
 
-``timing``: when each row of each frame is exposed and read. ``imu``: what a gyroscope and an accelerometer at the
-rig's body measure, and what is true; the noise is that of IEEE Std 952 as camera calibration states it (Kalibr):
-white noise and a bias that walks, each given by its density.
+``timing`` holds the exposure times of each row of each frame. ``imu`` holds measured and true samples of a
+gyroscope and an accelerometer at the rig's body. The noise model is that of IEEE Std 952, parametrised as in
+Kalibr: white noise and a random walk of the bias, each given by its density.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ _NS = 1e9
 
 
 def table_file(side: str, frame: int) -> str:
-    """Below the folder of a sequence."""
+    """Return the path of the row times of one frame, below the folder of a sequence."""
     return f"timing/{side}_{frame}.csv"
 
 
 def timing_files(frames: int) -> tuple[str, ...]:
-    """All of them, of a sequence of so many frames."""
+    """Return the paths of all files of the channel ``timing`` for a sequence of ``frames`` frames."""
     return (TIMING_MANIFEST, *(table_file(*view) for view in views_of(frames)))
 
 
 def timing_manifest(
     shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frames: int
 ) -> dict[str, Any]:
-    """Content of timing.json: of each camera what makes its tables; times count from that of row 0 of frame 0."""
+    """Return the content of timing.json: the readout parameters of each camera, from which its tables follow."""
     readout_ns = {side: _NS * shutter.ratio_of(side) * frame_period_s for side in SIDES}
     cameras = {
         side: {
@@ -67,7 +67,7 @@ def timing_manifest(
 def timing_table(
     shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, side: Side, frame: int
 ) -> NDArray[np.int64]:
-    """(H, 4) in the order of ``TIMING_COLUMNS``, whole nanoseconds; of columns where the camera reads those."""
+    """Return a table (lines, 4) of row (or column) times; columns as in ``TIMING_COLUMNS``, whole nanoseconds."""
     rows = np.arange(shutter.lines(side))
     middle = _NS * frame_period_s * shutter.line_times(frame, side)
     half = 0.5 * _NS * (sensor.of(side, frame).exposure_s if sensor else 0.0)
@@ -77,7 +77,7 @@ def timing_table(
 def write_timing(
     folder: Path, shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frames: int
 ) -> None:
-    """All ``timing_files`` below the folder of a sequence."""
+    """Write all ``timing_files`` below the folder of a sequence."""
     write_json(folder / TIMING_MANIFEST, timing_manifest(shutter, frame_period_s, sensor, frames))
     for side, frame in views_of(frames):
         table = timing_table(shutter, frame_period_s, sensor, side, frame)
@@ -85,16 +85,16 @@ def write_timing(
 
 
 def write_rows(path: Path, columns: str, rows: Iterable[Iterable[float]]) -> None:
-    """A CSV file with this header and numbers to their last bit."""
+    """Write a CSV file with this header and numbers in full precision."""
     lines = [",".join(map(repr, row)) for row in rows]
     write_bytes(path, ("\n".join([columns, *lines]) + "\n").encode())
 
 
 def read_timing_table(path: Path, height: int) -> NDArray[np.int64]:
-    """(height, 4) in the order of ``TIMING_COLUMNS``.
+    """Read a table (height, 4) with columns as in ``TIMING_COLUMNS``.
 
     Raises:
-        RsbenchError: missing, or not such a table.
+        RsbenchError: the file is missing or not such a table.
     """
     header, *lines = read_text(path).splitlines() or [""]
     with naming(f"{path}: not a table of whole numbers", ValueError, OverflowError):
@@ -109,7 +109,7 @@ IMU_FILES = (IMU_MANIFEST, MEASURED, TRUE)
 MEASURED_COLUMNS = "stamp_ns,wx,wy,wz,ax,ay,az"
 TRUE_COLUMNS = "time_ns,wx,wy,wz,ax,ay,az,bwx,bwy,bwz,bax,bay,baz"
 MARGIN_S = 0.05
-"""Measured before the first row is exposed and after the last one."""
+"""Time for which the IMU also measures before the first exposure and after the last one, seconds."""
 _FASTEST_HZ, _LONGEST_OFFSET_S, _WORST_DRIFT = 1e4, 1.0, 1e-2
 
 
@@ -124,10 +124,10 @@ class Imu:
     rate_hz: float = 200.0
     """Samples per second."""
     gyroscope_noise_density: float = 1.6968e-4
-    """White noise of the gyroscope, rad/s/sqrt(Hz): a sample has it times sqrt(rate)."""
+    """White noise of the gyroscope, rad/s/sqrt(Hz); a sample's standard deviation is this times sqrt(rate)."""
     gyroscope_random_walk: float = 1.9393e-5
-    """Random walk of the gyroscope's bias, rad/s^2/sqrt(Hz): a step from one sample to the next has it times
-    sqrt(1 / rate)."""
+    """Random walk of the gyroscope's bias, rad/s^2/sqrt(Hz); the standard deviation of a step between samples is
+    this times sqrt(1 / rate)."""
     gyroscope_bias: float = 0.02
     """Standard deviation of the gyroscope's bias at the first sample, rad/s."""
     accelerometer_noise_density: float = 2.0e-3
@@ -139,7 +139,7 @@ class Imu:
     time_offset_s: float = 0.0
     """Seconds by which the IMU's clock is ahead of the camera's at the time of row 0 of frame 0."""
     clock_drift: float = 0.0
-    """Seconds that the IMU's clock gains in each second of the camera's."""
+    """Seconds that the IMU's clock gains on the camera's per second."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -156,24 +156,27 @@ class Imu:
 
 
 class ImuSamples(NamedTuple):
-    """Samples (n) in the order of time."""
+    """Inertial samples (n) in order of time."""
 
     stamps_ns: NDArray[np.int64]
-    """(n,) by the sensor's own clock."""
+    """(n,) time stamps by the IMU's clock."""
     measured: FloatArray
-    """(n, 6) angular velocity, rad/s, and specific force, m/s^2, in the axes of the body."""
+    """(n, 6) measured angular velocity, rad/s, and specific force, m/s^2, in the axes of the body."""
     times_ns: NDArray[np.int64]
-    """(n,) true: 0 is row 0 of frame 0, as in the channel ``timing``."""
+    """(n,) true times since row 0 of frame 0, as in the channel ``timing``."""
     true: FloatArray
-    """(n, 6) likewise."""
+    """(n, 6) true values of the same quantities."""
     bias: FloatArray
-    """(n, 6) what of ``measured - true`` is not white."""
+    """(n, 6) true bias: ``measured - true`` without the white noise."""
 
 
 def sample_times_ns(
     imu: Imu, shutter: RollingShutter, frame_period_s: float, sensor: Sensor | None, frames: int
 ) -> NDArray[np.int64]:
-    """True times (n,) of the samples: whole periods of the sensor, over all exposures and ``MARGIN_S`` beyond."""
+    """Return the true times (n,) of the samples, from ``MARGIN_S`` before to ``MARGIN_S`` after all exposures.
+
+    They are multiples of the IMU's period.
+    """
     lines = [shutter.line_times(frame, side) for side, frame in views_of(frames)]
     first, last = (frame_period_s * reach(np.concatenate(lines)) for reach in (np.min, np.max))
     beyond = MARGIN_S + 0.5 * (sensor.longest_s if sensor else 0.0)
@@ -186,19 +189,19 @@ def sample_times_ns(
 def true_samples(
     motion: Motion, times_ns: NDArray[np.int64], frame_period_s: float, gravity: FloatArray
 ) -> FloatArray:
-    """(n, 6) of ``ImuSamples.true`` at times (n,); ``gravity`` (3,) m/s^2 in the world frame."""
+    """Return ``ImuSamples.true`` (n, 6) at times (n,); ``gravity`` (3,) is in the world frame, m/s^2."""
     felt = inertial(motion, times_ns / (_NS * frame_period_s), frame_period_s, gravity)
     return np.concatenate([felt.turn, felt.force], axis=1)
 
 
 def stamps_of(imu: Imu, times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """What the sensor's clock shows at true times (n,)."""
+    """Convert true times (n,) to time stamps of the IMU's clock."""
     gained = np.round(_NS * imu.time_offset_s + imu.clock_drift * times_ns).astype(np.int64)
     return np.asarray(times_ns + gained)
 
 
 def deviations(imu: Imu) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Standard deviations (6,) of a sample's white noise, of a step of the bias, and of the first bias."""
+    """Return the standard deviations (6,) of a sample's white noise, a bias step, and the initial bias."""
     root = math.sqrt(imu.rate_hz)
     per_kind = (
         (imu.gyroscope_noise_density * root, imu.accelerometer_noise_density * root),
@@ -212,7 +215,7 @@ def deviations(imu: Imu) -> tuple[FloatArray, FloatArray, FloatArray]:
 def draw_samples(
     imu: Imu, motion: Motion, times_ns: NDArray[np.int64], frame_period_s: float, gravity: FloatArray, seed: str
 ) -> ImuSamples:
-    """Measure a motion; the same seed draws the same noise whatever the motion."""
+    """Simulate the measurement of a motion; the noise depends on the seed, but not on the motion."""
     rng = generator(f"{seed}/imu")
     noise, walk, start = deviations(imu)
     steps = rng.standard_normal((len(times_ns), 6)) * np.where(np.arange(len(times_ns))[:, None] > 0, walk, start)
@@ -223,19 +226,19 @@ def draw_samples(
 
 
 def gyro_samples(samples: ImuSamples, frame_period_s: float) -> FloatArray:
-    """(n, 4) tau, w of ``Correspondences.gyro``: what was measured, by the sensor's own clock, wrong as it is.
+    """Return (n, 4) tau, w for ``Correspondences.gyro``: measured values at the uncorrected stamps of the IMU.
 
-    The motion carries points into the body, so w is the negative of the measured rate.
+    The motion maps the world to the body, so w is the negative of the measured rate.
     """
     tau = samples.stamps_ns / (_NS * frame_period_s)
     return np.column_stack([tau, -frame_period_s * samples.measured[:, :3]])
 
 
 def gravity_of(scene: Mapping[str, Any]) -> FloatArray:
-    """(3,) m/s^2 in the world frame, of what sequence.json says of its scene, whose z points up.
+    """Return gravity (3,), m/s^2, in the world frame, from the key ``scene`` of sequence.json; scenes have z up.
 
     Raises:
-        RsbenchError: it does not say from where it is seen.
+        RsbenchError: the viewpoint is missing or wrong.
     """
     place = parse_card(Viewpoint, {key: scene.get(key) for key in ("eye", "target")}, "sequence.json: scene")
     if "start" in scene:
@@ -245,13 +248,13 @@ def gravity_of(scene: Mapping[str, Any]) -> FloatArray:
 
 
 def imu_manifest(imu: Imu, gravity: FloatArray) -> dict[str, Any]:
-    """Content of imu.json."""
+    """Return the content of imu.json."""
     axes = "of the rig's body: x right, y down, z forward; the sensor is in its origin"
     return {"axes": axes, "gravity": gravity.tolist(), **asdict(imu)}
 
 
 def write_imu(folder: Path, imu: Imu, gravity: FloatArray, samples: ImuSamples) -> None:
-    """All ``IMU_FILES`` below the folder of a sequence."""
+    """Write all ``IMU_FILES`` below the folder of a sequence."""
     write_json(folder / IMU_MANIFEST, imu_manifest(imu, gravity))
     for file, columns, times, values in (
         (MEASURED, MEASURED_COLUMNS, samples.stamps_ns, samples.measured),
@@ -262,10 +265,10 @@ def write_imu(folder: Path, imu: Imu, gravity: FloatArray, samples: ImuSamples) 
 
 
 def read_imu(folder: Path) -> ImuSamples:
-    """The samples below the folder of a sequence.
+    """Read the samples below the folder of a sequence.
 
     Raises:
-        RsbenchError: a table that is missing or none, or two that are not of the same samples.
+        RsbenchError: a table is missing or invalid, or the two tables have different numbers of rows.
     """
     stamps, measured = _read_table(inside(folder, MEASURED), MEASURED_COLUMNS)
     times, values = _read_table(inside(folder, TRUE), TRUE_COLUMNS)
@@ -275,10 +278,10 @@ def read_imu(folder: Path) -> ImuSamples:
 
 
 def _read_table(path: Path, columns: str) -> tuple[NDArray[np.int64], FloatArray]:
-    """Times (n,), ns, and values (n, columns - 1).
+    """Read times (n,), ns, and values (n, columns - 1).
 
     Raises:
-        RsbenchError: missing, or not such a table.
+        RsbenchError: the file is missing or not such a table.
     """
     header, *lines = read_text(path).splitlines() or [""]
     with naming(f"{path}: not a table of numbers", ValueError, OverflowError):

@@ -65,17 +65,17 @@ _LIST = f"{HIDDEN}/files.json"
 
 @contextmanager
 def fresh_folder(out: Path, by: str = "rsbench correct", run: str = "") -> Iterator[Path]:
-    """A folder that replaces ``out`` when all is written; nothing is left after an error.
+    """Yield a folder that replaces ``out`` when it is complete; it is removed after an error.
 
-    After a kill or an interruption of a ``run`` that has a key, the next run of that key continues in the folder.
+    If a run with the key ``run`` is killed or interrupted, the next run with the same key continues in the folder.
 
     Earlier results of the same command are replaced: they are moved aside, and removed when the new ones are in
     place. If a kill comes in between, the next run moves them back.
 
     Args:
-        out: see above.
-        by: the command that writes.
-        run: key of all that decides what is written; without it nothing is resumed.
+        out: final folder.
+        by: name of the command.
+        run: key of everything that affects the output; without it, an interrupted run is not resumed.
 
     Raises:
         RsbenchError: ``out`` cannot be written, contains other files, is the working folder, or another command
@@ -103,7 +103,7 @@ def fresh_folder(out: Path, by: str = "rsbench correct", run: str = "") -> Itera
         files = files_below(fresh)
         (fresh / _LIST).parent.mkdir()
         write_json(fresh / _LIST, {"by": by, "files": files})
-        _refuse_others(out, place, by)  # that came meanwhile
+        _refuse_others(out, place, by)  # files may have been added in the meantime
         _exchange(fresh, place, old)
         remove(old)
         remove(hidden / _HALF)
@@ -139,7 +139,7 @@ def _exchange(fresh: Path, place: Path, old: Path) -> None:
         if place.exists():
             os.rename(place, old)
         os.rename(fresh, place)
-    except BaseException:  # a signal too
+    except BaseException:  # also for signals
         if old.exists() and not place.exists():
             os.rename(old, place)
         raise
@@ -157,9 +157,9 @@ def copy_frame(folder: Path, name: str, twin: str) -> None:
 
 
 def write_frame(folder: Path, name: str, fused: Fused, *, whole: bool = True, orientation: int = UPRIGHT) -> None:
-    """corrected/NAME.png, mask/NAME.png and, of a ``whole`` frame, depth/NAME.exr below ``folder``.
+    """Write corrected/NAME.png, mask/NAME.png and, for a ``whole`` frame, depth/NAME.exr below ``folder``.
 
-    The ``orientation``, EXIF's number, is written to the first one; pixels are not rotated.
+    The EXIF ``orientation`` is written to the first file; pixels are not rotated.
     """
     for part in _PARTS if whole else list(_PARTS)[:2]:
         (folder / part).mkdir(parents=True, exist_ok=True)
@@ -377,11 +377,11 @@ def refuse_video(out: Path) -> None:
 
 @contextmanager
 def video_place(out: Path, run: str = "") -> Iterator[Path]:
-    """A work folder for a video ``out``, with the frames for ``write_video``; kept after a kill.
+    """Yield a work folder for a video ``out`` with the frames for ``write_video``; it is kept after a kill.
 
     Args:
-        out: the file.
-        run: key of all that decides what is written, as of ``fresh_folder``; without it nothing is resumed.
+        out: file of the video.
+        run: key of everything that affects the output, as for ``fresh_folder``; without it, nothing is resumed.
 
     Raises:
         RsbenchError: a file of that name exists that this command did not write, or the folder cannot be written.

@@ -1,4 +1,4 @@
-"""Destinations of a generated dataset: a local folder, or an object store."""
+"""Destinations of a generated dataset: a local folder or an object store."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ from rsbench.storage.work_folder import (
 
 @dataclass(frozen=True)
 class FolderTarget:
-    """Where the sequences of a folder go; picklable, for processes that render them."""
+    """Places finished sequences in a local folder; picklable, for processes that render them."""
 
     out: Path
 
     def work_folder(self) -> Path:
-        """A folder of this machine in which sequences are rendered."""
+        """Return a folder on this machine in which sequences are rendered."""
         return self.out / HIDDEN / WORK
 
     def place(self, partial: Path, name: str) -> None:
-        """Move a complete sequence, a folder in the work folder, to its name."""
+        """Move a complete sequence from the work folder to its final name."""
         place = self.out / name
         if os.path.lexists(place):
             _refuse_unknown_files(place, "it is to be replaced")
@@ -66,9 +66,9 @@ class FolderTarget:
 
 
 class FolderDestination:
-    """The folder of a dataset in which this command alone works.
+    """The folder of a dataset, locked for this command.
 
-    ``hidden`` is a folder of this machine for what a later run can use.
+    ``hidden`` is a folder on this machine for data that later runs can reuse.
     """
 
     def __init__(self, out: Path, hidden: Path, rehash: bool) -> None:
@@ -79,7 +79,7 @@ class FolderDestination:
     def complete(
         self, sequences: Sequence[SequenceCard], plans: Mapping[str, Plan], scene_hashes: SceneHashes
     ) -> Iterator[tuple[str, Files]]:
-        """Names and files of the sequences that were rendered from the same plans and have not changed since."""
+        """Yield names and files of sequences that were rendered from the same plans and are unchanged since."""
         for sequence in sequences:
             files = self._complete(sequence, plans[sequence.name], scene_hashes)
             if files is not None:
@@ -87,7 +87,7 @@ class FolderDestination:
         self._hashes.flush()
 
     def learned(self, name: str) -> Files:
-        """The files of a sequence that was just placed."""
+        """Return the files of a sequence that was just placed."""
         listed = read_json(self._out / name / "sequence.json")["files"]
         listed = {"sequence.json": sha256(self._out / name / "sequence.json"), **listed}
         files = {file: self._hashes.learn(f"{name}/{file}", digest) for file, digest in listed.items()}
@@ -95,11 +95,11 @@ class FolderDestination:
         return files
 
     def finish(self, card: DatasetCard, made: Mapping[str, Files]) -> None:
-        """Write dataset.json, unless it has this content."""
+        """Write dataset.json unless its content is unchanged."""
         write_manifest(card, self._out, made)
 
     def _complete(self, sequence: SequenceCard, plan: Plan, scene_hashes: SceneHashes) -> Files | None:
-        """The files of a sequence that was made from the same plan and has the bytes it had then; else None."""
+        """Return the files of a sequence that has the same plan and whose bytes are unchanged, else None."""
         folder = self._out / sequence.name
         if not os.path.lexists(folder):
             return None
@@ -125,7 +125,7 @@ class FolderDestination:
 
 
 def _refuse_unknown_files(folder: Path, why: str) -> None:
-    """What is to be removed must be rsbench's own, to the last file."""
+    """Raise RsbenchError unless all files of a folder that is to be removed were written by rsbench."""
     if folder.is_symlink():
         raise RsbenchError(f"{folder}: {why}, and it is a link: move it away, then run the same command again")
     if others := unknown_files(folder, is_of_sequence):
@@ -137,18 +137,18 @@ def _refuse_unknown_files(folder: Path, why: str) -> None:
 _OBJECTS = "objects.jsonl"
 _MANIFEST = "sequence.json"
 _REHASHED = 8
-"""Files in memory at once."""
+"""Number of files that are hashed, and so in memory, at the same time."""
 _MOST_CHILDREN = 1024
 """Largest number of processes on one machine of a cluster that write to one store."""
 
 
 @dataclass(frozen=True)
 class StoreTarget:
-    """Where the sequences of a store go, as ``FolderTarget``."""
+    """Places finished sequences in an object store, as ``FolderTarget`` does in a folder."""
 
     url: str
     work: Path | None
-    """Workplace; None where each process has one of its own, for it may be on another machine."""
+    """Work folder; None if each process has its own, because processes may run on other machines."""
 
     def work_folder(self) -> Path:
         return _own_work_folder(key_of(self.url)) if self.work is None else self.work
@@ -163,10 +163,10 @@ class StoreTarget:
 
 
 class _Known(NamedTuple):
-    """A sequence as it was sent or first seen."""
+    """State of a sequence in the store when it was uploaded or first seen."""
 
     token: str
-    """Size and token of its sequence.json, as in ``Listed``."""
+    """``Listed.state`` of its sequence.json: size and token."""
     sha256: str
     sizes: dict[str, int]
     manifest: Plan
@@ -178,7 +178,7 @@ class _Known(NamedTuple):
 
 
 class StoreDestination:
-    """The dataset of an object store, as ``FolderDestination``."""
+    """A dataset in an object store, with the interface of ``FolderDestination``."""
 
     def __init__(self, store: Store, hidden: Path, target: StoreTarget, rehash: bool) -> None:
         self.hidden, self.target = hidden, target
@@ -223,7 +223,7 @@ class StoreDestination:
             self._store.upload({DATASET: work / DATASET})
 
     def _list(self, folder: str, names: Iterable[str]) -> None:
-        """See what the store has of these sequences; dataset.json is of the sequence without a name."""
+        """List the objects of these sequences in the store; dataset.json is listed under an empty name."""
         found = {name: dict[str, Listed]() for name in names}
         for path, listed in self._store.listing(folder).items():
             name, _, file = path.partition("/")
@@ -234,7 +234,7 @@ class StoreDestination:
         self._objects = found
 
     def _is_new(self, name: str) -> bool:
-        """Whether there is a sequence.json that has not been read, or has changed since."""
+        """Return whether the store has a sequence.json that is unread or has changed since it was read."""
         there = self._objects[name].get(_MANIFEST)
         return there is not None and (name not in self._lines or self._known(name).token != there.state)
 
@@ -242,8 +242,8 @@ class StoreDestination:
         return _Known(*json.loads(self._lines[name])[1:])
 
     def _learn(self, names: Iterable[str], sizes: Mapping[tuple[str, str], int]) -> None:
-        """Read each sequence.json; files have the ``sizes`` of their paths and hashes, else those that they have
-        there now."""
+        """Read each sequence.json and store its state; ``sizes`` by path and hash take precedence over the sizes
+        that the store lists now."""
         with (self.hidden / _OBJECTS).open("a", encoding="utf-8", newline="\n") as stream:
             for path, data in self._store.read([f"{name}/{_MANIFEST}" for name in names]):
                 name = path.partition("/")[0]
@@ -260,7 +260,7 @@ class StoreDestination:
                 stream.write(f"\n{self._lines[name]}\n")  # the line before may have been cut by a kill
 
     def _sizes_of_dataset(self) -> dict[tuple[str, str], int]:
-        """What dataset.json says of paths and hashes, as far as it can be read."""
+        """Return file sizes by path and hash from dataset.json; empty if it cannot be read."""
         with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):
             for _, data in self._store.read([DATASET]):
                 files = json.loads(data)["files"].items()
@@ -268,10 +268,13 @@ class StoreDestination:
         return {}
 
     def _complete(self, sequence: SequenceCard, plan: Plan, scene_hashes: SceneHashes) -> _Known | None:
-        """A sequence that was made from the same plan and has files of the sizes that they had then; else None."""
+        """Return a sequence that has the same plan and whose files have unchanged sizes, else None.
+
+        With ``rehash``, the hashes of the files are compared too.
+        """
         objects, place = self._objects[sequence.name], f"{self._store.url}/{sequence.name}"
         others = named(sorted(file for file in objects if not is_of_sequence(file)))
-        if _MANIFEST not in objects:  # nothing is there, or what was sent until a run was stopped
+        if _MANIFEST not in objects:  # there is nothing, or an interrupted upload
             if others:
                 raise RsbenchError(
                     f"{place}: holds {others}, which is not rsbench's: move it away or choose another --out"
@@ -310,7 +313,7 @@ def _parsed(data: bytes, path: str) -> Plan:
 
 
 def _read_lines(path: Path) -> dict[str, str]:
-    """The last line of each sequence, in which all that ``_Known`` has stands behind its name."""
+    """Return the last line of each sequence: a JSON list of its name and the fields of ``_Known``."""
     lines = {}
     with contextlib.suppress(FileNotFoundError), path.open(encoding="utf-8", errors="replace") as stream:
         for line in stream:
@@ -322,10 +325,10 @@ def _read_lines(path: Path) -> dict[str, str]:
 
 
 def store_for(url: str, workers: Workers) -> Store:
-    """The store of a URL, if so many can write there.
+    """Open the store of a URL for these workers.
 
     Raises:
-        RsbenchError: see ``Store``; or processes of a store in this process's memory.
+        RsbenchError: see ``Store``, or several processes would use a store in this process's memory.
     """
     if url.startswith("memory:") and workers != 1:
         raise RsbenchError(f"--out {url}: lives in one process: without --workers and --scheduler")
@@ -336,9 +339,9 @@ def store_for(url: str, workers: Workers) -> Store:
 def open_destination(
     out: Path | str, workers: Workers, rehash: bool
 ) -> Iterator[FolderDestination | StoreDestination]:
-    """A folder, made if missing, or the store of a URL, in which no other command of this machine works.
+    """Open a folder, created if missing, or the store of a URL, locked against other commands on this machine.
 
-    ``rehash`` reads every file again, whatever hashes are known.
+    ``rehash`` reads every file again and ignores known hashes.
 
     Raises:
         RsbenchError: see ``store_for`` and ``work_folder``.
@@ -354,12 +357,12 @@ def open_destination(
 
 
 _kept = contextlib.ExitStack()
-"""As long as this process."""
+"""Keeps the lock of the work folder until this process ends."""
 
 
 @cache
 def _own_work_folder(key: str) -> Path:
-    """The first free one on this machine; its last owner may have been killed there."""
+    """Lock and return the first free work folder on this machine; a killed process may have used it before."""
     base = (temporary() or Path(tempfile.mkdtemp())) / "stores" / key
     for number in range(_MOST_CHILDREN):
         place = base / str(number)

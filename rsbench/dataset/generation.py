@@ -70,7 +70,7 @@ Build = Callable[[str], Built]
 
 
 class PosedScenes:
-    """The renderer's scene of the last sequence, which sequences with the same viewpoint share."""
+    """Caches the renderer's scene of the last sequence for sequences with the same viewpoint."""
 
     def __init__(self, build: Build) -> None:
         self._build = build
@@ -78,12 +78,12 @@ class PosedScenes:
         self._scene: Any = None
 
     def set_for(self, sequence: SequenceCard) -> tuple[MitsubaScene, str]:
-        """The scene in the frame of a sequence, and the hash of the scene."""
+        """Return the scene in the frame of a sequence, and the hash of the scene."""
         from rsbench.renderers.scene import MitsubaScene
 
         place = place_of(sequence)
         if place != self._place:
-            self._scene = None  # not two at a time
+            self._scene = None  # keep only one scene in memory
         built = self._build(sequence.scene)
         if self._scene is None:
             self._scene, self._place = MitsubaScene(seen_scene(built.scene, sequence)), place
@@ -91,12 +91,12 @@ class PosedScenes:
 
 
 def place_of(sequence: SequenceCard) -> tuple[object, ...]:
-    """Values that determine the viewpoint of a sequence."""
+    """Return the values that determine the posed scene of a sequence."""
     return sequence.scene, sequence.viewpoint, sequence.start, sequence.moving
 
 
 def seen_scene(scene: Scene, sequence: SequenceCard) -> Scene:
-    """A scene in the frame of the body at time 0 of a sequence, with its moving objects."""
+    """Return a scene in the frame of the body at time 0 of a sequence, with its moving objects."""
     seen = scene.seen_from(scene.viewpoints[sequence.viewpoint], sequence.start)
     return with_moving(seen, sequence.moving) if sequence.moving else seen
 
@@ -106,8 +106,7 @@ Progress = Callable[[str], None]
 
 
 def steps_of(card: DatasetCard) -> int:
-    """Steps of each sequence: two renderings of each camera and time, by both shutters, and placing the
-    sequence."""
+    """Return the number of steps of a sequence: one per camera, frame and shutter, and one for placing it."""
     return 1 + 2 * len(SIDES) * card.frames
 
 
@@ -126,13 +125,13 @@ def generate_dataset(
     the number of workers and however often the run was interrupted.
 
     Args:
-        card: what to make.
-        out: folder of the dataset, made if missing, or the URL of a store, to which sequences are sent when they
-            are complete (``StoreDestination``).
-        workers: processes, or a cluster; each renders whole sequences.
-        full_frames: make every rolling-shutter frame as the paper did, from one whole global-shutter image per
+        card: card of the dataset.
+        out: folder of the dataset, created if missing, or the URL of a store, to which complete sequences are
+            uploaded (``StoreDestination``).
+        workers: number of processes, or a cluster; each process renders whole sequences.
+        full_frames: render every rolling-shutter frame as in the paper, from one whole global-shutter image per
             row, and keep these images as gs_stack/<side>_<frame>/<row>.png.
-        rehash: read every file again, even with unchanged size and times; those of a store are downloaded.
+        rehash: read every file again, even with unchanged size and times; files of a store are downloaded.
         progress: see ``Progress``.
 
     Raises:
@@ -183,7 +182,7 @@ def build_scene(name: str) -> Built:
 
 @dataclass(frozen=True)
 class _Run:
-    """What renders the sequences of a card; picklable, for processes that share them."""
+    """Renders the sequences of a card; picklable, for distribution to several processes."""
 
     card: DatasetCard
     options: RendererOptions
@@ -192,7 +191,7 @@ class _Run:
     def sequences(
         self, todo: list[SequenceCard], plans: dict[str, Plan], build: Build, workers: Workers
     ) -> Iterator[tuple[str, int]]:
-        """Names of sequences, with the steps done; the last step of a sequence is reported when it is complete."""
+        """Yield names of sequences with the steps done; the last step is reported when a sequence is complete."""
         if workers == 1 or not todo:
             stage = PosedScenes(build)
             for sequence in todo:
@@ -241,7 +240,7 @@ class _Run:
 
 
 def _serve_renders(run: _Run, threads: int) -> Callable[[tuple[SequenceCard, Plan]], None]:
-    """What renders sequences, in a child."""
+    """Return the function that renders sequences in a child process."""
     from rsbench.renderers.backend import set_threads, start_backend
 
     start_backend()
@@ -271,10 +270,10 @@ def render_camera(
     *,
     rolling_alone: bool = False,
 ) -> Iterator[None]:
-    """One camera at one time: the rolling-shutter frame, then the global-shutter frames at poses of its rows.
+    """Render the rolling-shutter frame of one camera, then the global-shutter frames at poses of its rows.
 
-    The sensor is applied to the rolling-shutter frame only; the clean frame is kept too. Channels are written
-    ``later``.
+    The sensor is applied only to the rolling-shutter frame, which is also kept without it. ``later`` starts the
+    writing of files.
     """
     from rsbench.renderers.image import to_srgb8
     from rsbench.renderers.render import sensed_rows
@@ -318,7 +317,7 @@ def render_camera(
 def sequence_truth(
     folder: Path, card: DatasetCard, sequence: SequenceCard, scene: MitsubaScene, record: Mapping[str, Any]
 ) -> SequenceTruth:
-    """The truth of a rendered sequence, from its card; ``record`` is that of the scene."""
+    """Return the data for the channels of a whole sequence; ``record`` is the table ``scene`` of sequence.json."""
     from rsbench.renderers.visibility import SceneRays
 
     geometry = FixedGeometry(
@@ -347,7 +346,7 @@ def render_view(
     on_gs_frame: OnGlobalFrame | None = None,
     rows: list[int] | None = None,
 ) -> Frame:
-    """A view of a sequence; ``poses`` are those of the lines of its rolling-shutter frame."""
+    """Render a view of a sequence; ``poses`` are those of the lines of its rolling-shutter frame."""
     from rsbench.renderers.render import LinePoses, render
 
     shutter = geometry.shutter
@@ -355,7 +354,7 @@ def render_view(
     if view.shutter == "gs":
         line = shutter.line_after(view.row, view.side)
         poses = Pose(np.broadcast_to(poses.R[line], poses.R.shape), np.broadcast_to(poses.t[line], poses.t.shape))
-        # No stitching: all rows have one pose, and one time.
+        # Stitching is not needed, because all rows have the same pose and time.
         tau, options = np.full(tau.shape, tau[line]), replace(options, method="single-pass")
     lines = LinePoses(*poses, poses_of(geometry.objects, tau), columns)
     return render(scene, geometry.rig.sensor(view.side), lines, options, rows=rows, on_gs_frame=on_gs_frame)
@@ -369,18 +368,18 @@ def _stack_writer(folder: Path, options: RendererOptions) -> Callable[[int, NDAr
 
 
 _LISTED_BYTES = 200
-"""Bytes that a file takes in sequence.json and dataset.json."""
+"""Number of bytes of a file's entries in sequence.json and dataset.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """Estimated cost of a dataset: that of left frames, times the ratio of the pixels of all frames to theirs."""
+    """Estimated cost of a dataset, extrapolated from left frames by the number of pixels."""
 
     sequences: int
     files: int
     bytes: int
     seconds: float
-    """On this machine, in one process."""
+    """Rendering time on this machine in one process, seconds."""
 
 
 def estimate_dataset(card: DatasetCard, progress: Callable[[str], None]) -> Estimate:

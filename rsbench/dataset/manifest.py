@@ -1,6 +1,6 @@
 """dataset.json and croissant.json: the card of a dataset and the files of all of its sequences.
 
-The identity of a sequence is the hash of its scene, and all of a card that decides its bytes.
+A sequence is identified by the hash of its scene and all settings of the card that affect its bytes.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ _KINDS = {
 _WHERE = "https://github.com/rsbench/rsbench"
 _SEQUENCE = r"(?:.*[/\\])?([^/\\]+)[/\\]%s[/\\][^/\\]+$"
 _SIDE, _FRAME = r".*[/\\](left|right)_[0-9]+\.[a-z]+$", r".*_([0-9]+)\.[a-z]+$"
-"""Pattern of whole paths, from their beginning."""
+"""Patterns that match whole paths, from their beginning."""
 _POSE = {name: "sc:Float" for name in ("tau", "qw", "qx", "qy", "qz", "tx", "ty", "tz")}
 
 
 def croissant_of(manifest: Mapping[str, Any], sha256: str) -> dict[str, Any]:
-    """The content of croissant.json; ``manifest`` and ``sha256`` are those of the dataset.json beside it."""
+    """Return the content of croissant.json; ``manifest`` and ``sha256`` belong to the dataset.json beside it."""
     return {
         "@context": _context(),
         "@type": "sc:Dataset",
@@ -70,7 +70,7 @@ def croissant_of(manifest: Mapping[str, Any], sha256: str) -> dict[str, Any]:
 
 
 def _context() -> dict[str, Any]:
-    """As the specification has it, whether a word stands here or not."""
+    """Return the context that the specification requires, including terms that are not used here."""
     return {
         "@language": "en",
         "@vocab": "https://schema.org/",
@@ -99,7 +99,7 @@ def _manifest_file(sha256: str) -> dict[str, Any]:
 
 
 def _file_sets(files: Iterable[str]) -> list[dict[str, Any]]:
-    """One for each place below a sequence and kind of file in it; ``files``: SEQUENCE/[FOLDER/...]NAME."""
+    """Return a file set for each folder of a sequence and file type; ``files`` are SEQUENCE/[FOLDER/...]NAME."""
     names, taken = dict[str, str](), set[str]()
     for file in files:
         place, *below = PurePosixPath(file).parts[1:]
@@ -175,7 +175,7 @@ Files = dict[str, HashedFile]
 
 
 def write_manifest(card: DatasetCard, out: Path, made: Mapping[str, Files]) -> None:
-    """Write dataset.json and croissant.json where they do not say this already; ``made``: files of sequences."""
+    """Write dataset.json and croissant.json unless unchanged; ``made`` are the files of each sequence."""
     content = manifest_of(card, made)
     _write(out / DATASET, content)
     _write(out / CROISSANT, croissant_of(content, sha256(out / DATASET)))
@@ -191,7 +191,7 @@ def _write(path: Path, content: dict[str, Any]) -> None:
 
 
 def manifest_of(card: DatasetCard, made: Mapping[str, Files]) -> dict[str, Any]:
-    """The content of dataset.json; ``made`` as of ``write_manifest``."""
+    """Return the content of dataset.json; ``made`` as for ``write_manifest``."""
     files = {
         f"{sequence.name}/{name}": {"sha256": file.sha256, "size": file.size}
         for sequence in card.sequence
@@ -212,7 +212,7 @@ def manifest_of(card: DatasetCard, made: Mapping[str, Files]) -> dict[str, Any]:
 
 
 def says(data: bytes, content: dict[str, Any]) -> bool:
-    """Whether a file holds this already; to read millions of lines is much faster than to write them."""
+    """Return whether a file already has this content; reading a large file is much faster than rewriting it."""
     try:
         return bool(json.loads(data) == json.loads(json.dumps(content)))
     except (ValueError, RecursionError):
@@ -220,7 +220,7 @@ def says(data: bytes, content: dict[str, Any]) -> bool:
 
 
 def _record(card: DatasetCard) -> dict[str, Any]:
-    """The complete card; without ``frames`` where there are two, and without newer keys where they say nothing."""
+    """Return the complete card, without newer keys at their defaults and without ``frames`` if there are two."""
     own = _without_new_keys(asdict(card))
     if card.camera is not None and card.camera.lens is not None:
         own["camera"]["lens"] = card.camera.lens.record()
@@ -237,7 +237,7 @@ def _without_new_keys(value: Any) -> Any:
 
 
 def scene_hash(scene: Scene) -> str:
-    """Hash of all that is rendered of a scene: geometry, materials and light."""
+    """Return the hash of everything in a scene that affects images: geometry, materials and light."""
     digest = hashlib.sha256()
     digest.update(repr(scene.light).encode())
     if scene.light.environment is not None:
@@ -249,12 +249,12 @@ def scene_hash(scene: Scene) -> str:
 
 
 def mesh_file_hash(mesh: MeshFile) -> str:
-    """SHA-256 of the meshes of one moving mesh file; RsbenchError if the file cannot be read."""
+    """Return the SHA-256 of the meshes of a moving mesh file; raise RsbenchError if it cannot be read."""
     return hashlib.sha256(b"".join(_bytes_of(mesh.meshes()))).hexdigest()
 
 
 def hashes_of_meshes(moving: Sequence[Body], mesh_hash: Callable[[MeshFile], str]) -> dict[str, Any]:
-    """What a sequence.json says of the mesh files of its objects: ``meshes``, where there are any."""
+    """Return the entry ``meshes`` of a sequence.json: hashes of the objects' mesh files; empty without any."""
     hashes = {str(number): mesh_hash(each.mesh) for number, each in enumerate(moving, start=1) if each.mesh}
     return {"meshes": hashes} if hashes else {}
 
@@ -269,13 +269,13 @@ def _bytes_of(meshes: Sequence[SceneMesh]) -> Iterator[bytes]:
 
 
 class SceneHashes:
-    """Hashes of scenes; not built again where the card and our code say all."""
+    """Hashes of scenes, stored between runs for scenes that depend only on their card and our code."""
 
     def __init__(self, store: Path, build: Callable[[str], str]) -> None:
         """
         Args:
-            store: JSON file of what was built before; need not exist.
-            build: builds the scene of a name and returns the hash.
+            store: JSON file with the hashes of earlier runs; it need not exist.
+            build: builds the scene with a name and returns its hash.
         """
         self._store, self._build = store, build
         self._by_name: dict[str, str] = {}
@@ -285,7 +285,7 @@ class SceneHashes:
             self._known = {}
 
     def of(self, name: str) -> str:
-        """The hash of a scene by the name or path of its card; each card is read once."""
+        """Return the hash of a scene by the name or path of its card; each card is read once."""
         if name not in self._by_name:
             self._by_name[name] = self._find(name)
         return self._by_name[name]
@@ -301,7 +301,7 @@ class SceneHashes:
 
 
 def scene_key(name: str) -> str | None:
-    """Equal keys are equal scenes on one machine; None when files or other packages' code decide too."""
+    """Return a key that identifies a scene on one machine; None if it depends on files or other packages' code."""
     card, builder = read_scene_card(card_path("scenes", name))
     key = built_key(builder, card.seed)
     if key is None or card.light.environment:
@@ -310,14 +310,14 @@ def scene_key(name: str) -> str | None:
 
 
 Plan = dict[str, Any]
-"""All that decides the bytes of a sequence, as it stands in its sequence.json; but for the hash of the scene."""
+"""All settings that affect the bytes of a sequence, as in its sequence.json, except the hash of the scene."""
 
 
 def plans_of(card: DatasetCard, options: RendererOptions) -> dict[str, Plan]:
-    """The plan of each sequence by its name.
+    """Return the plan of each sequence by its name.
 
     Raises:
-        RsbenchError: no such scene, viewpoint or mesh, or moving objects with an integrator that has none.
+        RsbenchError: a scene, viewpoint or mesh does not exist, or the integrator does not support moving objects.
     """
     scenes = lru_cache(maxsize=None)(lambda name: read_scene_card(card_path("scenes", name))[0])
     mesh_hash = lru_cache(maxsize=None)(mesh_file_hash)
@@ -332,12 +332,12 @@ def of_scene(plan: Plan, sha256: str) -> Plan:
 
 
 def with_gloss(plan: Plan, glossy: bool) -> Plan:
-    """What only the scene says: whether any of its surfaces is glossy."""
+    """Return the plan with ``glossy`` if the scene, once loaded, has any glossy surface."""
     return plan | {"glossy": True} if glossy else plan
 
 
 def check_same(place: object, manifest: Plan, plan: Plan, scene_sha256: str) -> None:
-    """Raise RsbenchError unless the sequence.json of a place was made from this plan and scene."""
+    """Raise RsbenchError unless the sequence.json at ``place`` was made from this plan and scene."""
     expected = dict.fromkeys(
         ("sensor", "channels", "imu", "matches", "twins", "exposed_twins", "frames", "moving", "meshes")
     )
@@ -350,13 +350,13 @@ def check_same(place: object, manifest: Plan, plan: Plan, scene_sha256: str) -> 
 
 
 def hashes_in(manifest: Plan) -> dict[str, Any]:
-    """Hashes of the files of a sequence by path, from its sequence.json; not checked."""
+    """Return the unchecked hashes of a sequence's files by path, from its sequence.json."""
     listed = manifest.get("files")
     return listed if isinstance(listed, dict) else {}
 
 
 def wanted_files(manifest: Plan, plan: Plan) -> list[str]:
-    """Paths that a sequence of a plan must have, and those that its sequence.json lists; that one apart."""
+    """Return the paths that the plan requires and those that sequence.json lists, except sequence.json itself."""
     needed = files_of(with_gloss(plan, manifest.get("glossy") is True))
     return list({**dict.fromkeys(needed), **hashes_in(manifest)})
 

@@ -1,7 +1,7 @@
-"""The channels of points.
+"""The channels of points: ``tracks``, ``affine`` and ``matches``.
 
-``tracks`` are surface points and where each frame sees them, ``affine`` their surroundings, ``matches`` what a
-feature matcher finds in two successive frames, labelled by the truth.
+``tracks`` are surface points and their pixels in each frame, ``affine`` are local affine maps between these
+pixels, and ``matches`` are the matches of a feature matcher in two successive frames, labelled with ground truth.
 """
 
 from __future__ import annotations
@@ -42,25 +42,25 @@ if TYPE_CHECKING:
     from rsbench.vision.feature_matcher import FeatureEntry
 
 IN_ALL = 2048
-"""Points drawn from the pixels of all frames, of each as many."""
+"""Number of points drawn from all frames together, the same number from each."""
 
 
 def track_views(frames: int) -> tuple[View, ...]:
-    """Left 0, right 0, left 1, right 1, ...: the order of the frames in the arrays, and of ``Sequence.images``."""
+    """Return left 0, right 0, left 1, right 1, ...: the order of frames in the arrays and ``Sequence.images``."""
     return tuple((side, frame) for frame in range(frames) for side in SIDES)
 
 
 def _source_type(views: int) -> np.dtype[Any]:
-    """Type of the numbers of frames."""
+    """Return the smallest integer type for frame numbers."""
     return np.min_scalar_type(views - 1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ArrayFile:
-    """Arrays that are stored as an npz file under the names of their fields."""
+    """Base of dataclasses whose arrays are stored in an npz file under the names of the fields."""
 
     def check_arrays(self, wanted: Mapping[str, tuple[tuple[int, ...], DTypeLike]]) -> None:
-        """Raises ValueError for an array of another shape or type than is wanted by its name."""
+        """Raise ValueError if an array does not have the shape and type that ``wanted`` gives for its name."""
         for name, (shape, kind) in wanted.items():
             value = getattr(self, name)
             if value.shape != shape or value.dtype != kind:
@@ -69,22 +69,22 @@ class ArrayFile:
                 )
 
     def save(self, path: Path) -> None:
-        """Write the file."""
+        """Write the arrays to an npz file."""
         save_arrays(path, {field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read the file; RsbenchError as of ``load_arrays``, and for arrays that are not possible."""
+        """Read the arrays from an npz file; raise RsbenchError as ``load_arrays`` does, or for invalid arrays."""
         with naming(path, TypeError, ValueError):
             return cls(**load_arrays(path))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tracks(ArrayFile):
-    """Points (n) and what became of them in all frames (v), in the order of ``track_views``.
+    """Surface points (n) and their pixels and visibility in all frames (v), in the order of ``track_views``.
 
     Raises:
-        ValueError: arrays of other shapes or types, or of points, sources or classes that cannot be.
+        ValueError: an array has the wrong shape or type, or points, sources or classes are invalid.
     """
 
     points: FloatArray
@@ -92,11 +92,11 @@ class Tracks(ArrayFile):
     sources: NDArray[np.unsignedinteger[Any]]
     """(n,) number of the frame from whose pixels the point was drawn."""
     pixels: FloatArray
-    """(n, v, 2) px, between pixels too; NaN where a frame does not see the point."""
+    """(n, v, 2) sub-pixel coordinates, px; NaN if the point does not project into the frame."""
     tau: FloatArray
-    """(n, v) times at which the frames see it, frame periods; NaN likewise."""
+    """(n, v) times of these pixels, frame periods; NaN like ``pixels``."""
     classes: NDArray[np.uint8]
-    """(n, v) of ``PixelClass``: VISIBLE, OCCLUDED (the pixel is known), OUT_OF_VIEW or UNSOLVED."""
+    """(n, v) values of ``PixelClass``: VISIBLE, OCCLUDED (the pixel is known), OUT_OF_VIEW or UNSOLVED."""
 
     def __post_init__(self) -> None:
         n, f8 = len(self.points), np.float64
@@ -115,13 +115,13 @@ def make_tracks(
     blocked: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
     seed: str,
 ) -> Tracks:
-    """Draw pixels with a surface from each frame, ``IN_ALL`` together, and look for their points in all of them.
+    """Draw pixels with a surface, ``IN_ALL`` from all frames together, and project their points to all frames.
 
     Args:
-        geometry: of the sequence.
-        depths: (H, W) of each rolling-shutter frame, metres, 0 = no surface.
-        blocked: see ``views.Blocked``.
-        seed: of the draw.
+        geometry: geometry of the sequence.
+        depths: depth map (H, W) of each rolling-shutter frame, metres, 0 = no surface.
+        blocked: returns which points are occluded from eyes, like ``views.Blocked`` but without times.
+        seed: seed of the draw.
     """
     views = track_views(geometry.frames)
     count = max(1, IN_ALL // len(views))
@@ -130,7 +130,7 @@ def make_tracks(
     sources = np.repeat(np.arange(len(drawn), dtype=_source_type(len(views))), [len(X) for X, _ in drawn])
     seen = [look_for(geometry, view, points, blocked) for view in views]
     pixels, tau, classes = (np.stack(each, axis=1) for each in zip(*seen, strict=True))
-    # A frame that sees a point twice names the first row; where it was drawn, it is the pixel of the draw.
+    # If a frame sees a point twice, the first row is used, but in the source frame the drawn pixel itself.
     for k, (view, (_, grid)) in enumerate(zip(views, drawn, strict=True)):
         own = sources == k
         pixels[own, k], classes[own, k] = grid, PixelClass.VISIBLE
@@ -141,7 +141,7 @@ def make_tracks(
 def _drawn(
     geometry: Geometry, view: View, depth: NDArray[np.float32], seed: str, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """World points (n, 3) and the pixels (n, 2) that see them."""
+    """Draw pixels (n, 2) with a surface, and return the world points (n, 3) seen there and the pixels."""
     chosen = np.sort(generator(seed).permutation(np.flatnonzero(depth))[:count])
     y, x = np.divmod(chosen, depth.shape[1])
     pixels = np.column_stack([x, y]).astype(np.float64)
@@ -149,7 +149,7 @@ def _drawn(
 
 
 def points_at(geometry: Geometry, view: View, pixels: FloatArray, depth: NDArray[np.float32]) -> FloatArray:
-    """World points (n, 3) that whole pixels (n, 2) of a frame see."""
+    """Return the world points (n, 3) seen at integer pixels (n, 2) of a frame."""
     z = depth[pixels[:, 1].astype(np.int64), pixels[:, 0].astype(np.int64)]
     return back_project(geometry.rig, geometry.shutter, geometry.motion, *view, pixels, z)
 
@@ -160,7 +160,7 @@ def look_for(
     points: FloatArray,
     blocked: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
 ) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
-    """Pixels (n, 2), times (n,) and classes (n,) of points in a frame."""
+    """Return pixels (n, 2), times (n,) and classes (n,) of points (n, 3) in a frame."""
     side, frame = view
     found = rs_project(geometry.rig, geometry.shutter, geometry.motion, side, frame, points)
     inside = np.isfinite(found.tau)
@@ -177,14 +177,15 @@ class AffineFrames(ArrayFile):
     """Affine frames of the points (n) of ``tracks``.
 
     Raises:
-        ValueError: arrays of other shapes or types.
+        ValueError: an array has the wrong shape or type, or normals are not finite.
     """
 
     jacobians: FloatArray
-    """(n, v, 2, 2) derivative of the pixel in each frame (rows x, y) by the pixel in the source (columns x, y), on
-    the plane that the source sees; 1 in the source itself, NaN where a frame does not see the point."""
+    """(n, v, 2, 2) derivative of the pixel in each frame (rows x, y) by the pixel in the source (columns x, y),
+    for the tangent plane at the point; identity in the source, NaN if the point does not project into the
+    frame."""
     normals: FloatArray
-    """(n, 3) unit normal of that plane, towards the source, world frame; 0 where the ray met none, between two."""
+    """(n, 3) unit normal of that plane, towards the source, world frame; 0 if the ray passed between triangles."""
 
     def __post_init__(self) -> None:
         n, views = len(self.normals), self.jacobians.shape[1:2]
@@ -193,12 +194,12 @@ class AffineFrames(ArrayFile):
             raise ValueError("normals must be finite")
 
     def between(self, one: int, other: int) -> FloatArray:
-        """(n, 2, 2) derivative of the pixel in frame ``other`` by that in frame ``one``, by their numbers."""
+        """Return the derivative (n, 2, 2) of the pixel in frame number ``other`` by that in frame ``one``."""
         return self.jacobians[:, other] @ inverse_2x2(self.jacobians[:, one])
 
 
 def make_affine(geometry: Geometry, tracks: Tracks, rays: Rays) -> AffineFrames:
-    """The affine frames of tracks, on the surfaces that rays through their pixels meet."""
+    """Compute the affine frames of tracks on the surfaces hit by the rays through their source pixels."""
     normals = np.zeros_like(tracks.points)
     for k, (side, _) in enumerate(track_views(geometry.frames)):
         own = tracks.sources == k
@@ -209,7 +210,7 @@ def make_affine(geometry: Geometry, tracks: Tracks, rays: Rays) -> AffineFrames:
 
 
 def jacobians_of(geometry: Geometry, tracks: Tracks, normals: FloatArray) -> FloatArray:
-    """``AffineFrames.jacobians`` (n, v, 2, 2) of tracks on planes with these normals (n, 3)."""
+    """Compute ``AffineFrames.jacobians`` (n, v, 2, 2) of tracks on planes with these normals (n, 3)."""
     along = plane_basis(normals)
     views = enumerate(track_views(geometry.frames))
     moves = [_moves(geometry, view, tracks, k, along) for k, view in views]
@@ -222,7 +223,7 @@ def jacobians_of(geometry: Geometry, tracks: Tracks, normals: FloatArray) -> Flo
 
 
 def _moves(geometry: Geometry, view: View, tracks: Tracks, k: int, along: FloatArray) -> FloatArray:
-    """(n, 2, 2) derivative of the pixels of a frame by steps along two directions (n, 3, 2) from the points."""
+    """Return the derivative (n, 2, 2) of a frame's pixels by steps of the points along directions (n, 3, 2)."""
     tau = np.where(np.isnan(tracks.tau[:, k]), 0.0, tracks.tau[:, k])
     moves = pixel_moves(geometry.rig, geometry.shutter, geometry.motion, view[0], tau, tracks.points, along)
     return np.where(np.isnan(tracks.tau[:, k])[:, None, None], np.nan, moves)
@@ -234,35 +235,35 @@ MATCHED: dict[str, tuple[View, View]] = {
     "stereo_0": (("left", 0), ("right", 0)),
     "stereo_1": (("left", 1), ("right", 1)),
 }
-"""The pairs of pictures that a stereo solver uses of two successive frames, by their names in ``Correspondences``:
-from which to which. Their order numbers them."""
+"""The pairs of images, first and second, that a stereo solver uses from two successive frames, by their names in
+``Correspondences``. The numbers of the pairs follow this order."""
 
 
 class MatchClass(IntEnum):
-    """What is true of a match."""
+    """Ground-truth class of a match."""
 
     UNSOLVED = 0
-    """The row that sees the point could not be found."""
+    """The search for the row that sees the point did not converge."""
     RIGHT = 1
-    """The other picture sees the point within ``Matching.bound_px`` of the second keypoint."""
+    """The match is an inlier: the true pixel is within ``Matching.bound_px`` of the second keypoint."""
     OCCLUDED = 2
-    """The point is in view, but something nearer hides it: the match cannot be right."""
+    """The point is in view but occluded in the second image, so the match is an outlier."""
     OUT_OF_VIEW = 3
-    """The point is beside the other picture or behind its camera."""
+    """The point lies outside the second image or behind its camera."""
     NO_SURFACE = 4
-    """The first keypoint sees the sky; what is true of it is true of its direction."""
+    """The first keypoint shows the sky; its true pixel is that of a far point in the same direction."""
     WRONG = 5
-    """The other picture sees the point elsewhere."""
+    """The match is an outlier: the point is visible elsewhere in the second image."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Matching:
-    """Who matches, and how near a right match is."""
+    """The feature matcher and its inlier threshold."""
 
     features: str = "sift"
     """Name of a feature matcher, or the path of its card."""
     bound_px: float = 3.0
-    """Largest distance of the second keypoint from the true place in a match that counts as right."""
+    """Inlier threshold: largest distance of the second keypoint from its true pixel."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.bound_px < np.inf:
@@ -270,7 +271,7 @@ class Matching:
 
 
 class PairLabels(NamedTuple):
-    """The matches of one pair of frames: see ``LabelledMatches``."""
+    """The matches of one pair of images; for the fields see ``LabelledMatches``."""
 
     pixels: FloatArray
     depth: FloatArray
@@ -281,26 +282,26 @@ class PairLabels(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LabelledMatches(ArrayFile):
-    """Matches (n), those of each pair of frames together, in the order of ``MATCHED``; tracks come first.
+    """Matches (n), grouped by pair of images in the order of ``MATCHED``; in each group, tracks come first.
 
     Raises:
-        ValueError: arrays of other shapes or types, or of values that cannot be.
+        ValueError: an array has the wrong shape or type, or invalid values.
     """
 
     sets: NDArray[np.uint8]
-    """(n,) number of the pair of frames."""
+    """(n,) number of the pair of images."""
     tracks: NDArray[np.int32]
-    """(n,) number of the track through all four frames that the match is a part of; -1: of none."""
+    """(n,) number of the track through all four images to which the match belongs; -1: none."""
     pixels: FloatArray
-    """(n, 2, 2) px of both keypoints, as the matcher gives them."""
+    """(n, 2, 2) both keypoints from the matcher, px."""
     depth: FloatArray
-    """(n,) z of what the first keypoint sees, in the camera of its own time, metres; 0 = no surface."""
+    """(n,) depth z at the first keypoint, in the camera frame at the keypoint's time, metres; 0 = no surface."""
     truth: FloatArray
-    """(n, 2) px where the other picture sees that at its own time, hidden or not; NaN where it does not."""
+    """(n, 2) true pixel in the second image at its own time, px, also if occluded; NaN if out of view."""
     error: FloatArray
-    """(n,) distance of the second keypoint from it, px; NaN likewise."""
+    """(n,) distance of the second keypoint from the true pixel, px; NaN like ``truth``."""
     classes: NDArray[np.uint8]
-    """(n,) of ``MatchClass``."""
+    """(n,) values of ``MatchClass``."""
 
     def __post_init__(self) -> None:
         n, f8 = len(self.sets), np.float64
@@ -318,12 +319,12 @@ class LabelledMatches(ArrayFile):
             raise ValueError("tracks must be numbered 0, 1, ... in each pair of frames, as many in each")
 
     def of_pair(self, number: int) -> PairLabels:
-        """The matches of one pair of frames."""
+        """Return the matches of one pair of images."""
         own = self.sets == number
         return PairLabels(*(getattr(self, name)[own] for name in PairLabels._fields))
 
     def correspondences(self, keep: NDArray[np.bool_] | None = None) -> Correspondences:
-        """What a solver is given: all matches, or those of a mask (n,) and the tracks of which all parts are."""
+        """Return the input of a solver: all matches, or those in a mask (n,) and the tracks completely in it."""
         kept = np.ones(len(self.sets), dtype=np.bool_) if keep is None else keep
         rows = {name: self.pixels[(self.sets == k) & kept].reshape(-1, 4) for k, name in enumerate(MATCHED)}
         whole = (np.bincount(self.tracks[kept & (self.tracks >= 0)]) == len(MATCHED)).nonzero()[0]
@@ -335,19 +336,19 @@ _TRACK_HALF = {"left": [0, 1, 4, 5], "right": [2, 3, 6, 7], "stereo_0": [0, 1, 2
 
 
 def at(view: View, first: int) -> View:
-    """A view of ``MATCHED`` where the first of the two frames is ``first``."""
+    """Convert a view of ``MATCHED``, with frame 0 or 1, to a view of frame ``first`` or the next."""
     return view[0], first + view[1]
 
 
 class MatchRays(Protocol):
-    """Rays through a scene that does not move: ``renderers.segments.SceneRays`` is one."""
+    """Ray casting in a static scene, as ``renderers.visibility.SceneRays`` implements it."""
 
     def blocked(self, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]: ...
     def share(self, eyes: FloatArray, points: FloatArray) -> FloatArray: ...
 
 
 def matcher_record(matching: Matching) -> dict[str, Any]:
-    """Content of matcher.json: who matches, and the versions with which the same pictures match alike.
+    """Return the content of matcher.json: the feature matcher, and the versions on which its matches depend.
 
     Raises:
         RsbenchError: the feature matcher does not exist.
@@ -366,10 +367,10 @@ def matcher_record(matching: Matching) -> dict[str, Any]:
 
 
 def matched_frames(geometry: Geometry, first: int, images: Images, entry: FeatureEntry) -> Correspondences:
-    """What ``evaluate`` and ``correct`` match in two frames; another package's matcher runs in a child process.
+    """Match two frames as ``evaluate`` and ``correct`` do; another package's matcher runs in a child process.
 
     Raises:
-        RsbenchError: that failed, see ``find_correspondences``.
+        RsbenchError: the matcher failed, see ``find_correspondences``.
     """
     from rsbench.pipeline.frame_capture import find_matches_of_rig
     from rsbench.pipeline.frame_depth import CorrectionOptions
@@ -384,7 +385,7 @@ def matched_frames(geometry: Geometry, first: int, images: Images, entry: Featur
 def make_matches(
     geometry: Geometry, first: int, images: Images, matching: Matching, rays: MatchRays
 ) -> LabelledMatches:
-    """The labelled matches of frame ``first`` and the next, by their images (H, W, 3).
+    """Match the images (H, W, 3) of frame ``first`` and the next, and label the matches.
 
     Raises:
         RsbenchError: the feature matcher does not exist, or another package's failed.
@@ -396,7 +397,7 @@ def make_matches(
 
 
 class Arranged(NamedTuple):
-    """Correspondences as the channel has them: see ``LabelledMatches``."""
+    """Correspondences in the order of ``LabelledMatches``, which describes the fields."""
 
     sets: NDArray[np.uint8]
     tracks: NDArray[np.int32]
@@ -404,7 +405,7 @@ class Arranged(NamedTuple):
 
 
 def arranged(found: Correspondences) -> Arranged:
-    """The matches of each pair of frames, those of tracks first and once."""
+    """Group matches by pair of images; matches of tracks come first and are not repeated."""
     parts = []
     for number, name in enumerate(MATCHED):
         linked, own = found.tracks[:, _TRACK_HALF[name]], getattr(found, name)
@@ -417,7 +418,7 @@ def arranged(found: Correspondences) -> Arranged:
 def labelled(
     geometry: Geometry, first: int, matches: Arranged, bound_px: float, rays: MatchRays
 ) -> LabelledMatches:
-    """Label matches by the truth."""
+    """Label matches with their true pixels, errors and classes."""
     parts = []
     for number, views in enumerate(MATCHED.values()):
         source, target = (at(view, first) for view in views)
@@ -431,7 +432,7 @@ def labelled(
 def _truth_of(
     geometry: Geometry, source: View, target: View, pixels: FloatArray, bound_px: float, rays: MatchRays
 ) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
-    """Depth (n,), true places (n, 2) and classes (n,) of matches (n, 2, 2)."""
+    """Return depth (n,), true pixels (n, 2) and classes (n,) of matches (n, 2, 2)."""
     if len(pixels) == 0:
         return np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=np.uint8)
     eyes, ahead = looks(geometry, source, pixels[:, 0])
@@ -456,7 +457,7 @@ def classes_of(
     unsolved: NDArray[np.bool_],
     bound_px: float,
 ) -> NDArray[np.uint8]:
-    """(n,) of ``MatchClass``; the arguments (n, ...) are those of ``LabelledMatches``, and what is hidden."""
+    """Return values (n,) of ``MatchClass``; ``hidden`` marks occlusion, for the rest see ``LabelledMatches``."""
     with np.errstate(invalid="ignore"):
         right = np.linalg.norm(pixels[:, 1] - truth, axis=1) <= bound_px
     cases = [depth == 0.0, unsolved, np.isnan(truth[:, 0]), hidden, right]
@@ -465,7 +466,7 @@ def classes_of(
 
 
 def looks(geometry: Geometry, view: View, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Eyes (n, 3) and points (n, 3) at depth 1 of pixels (n, 2), between lines too; world frame, metres."""
+    """Return camera centres (n, 3) and points (n, 3) at depth 1 of sub-pixels (n, 2); world frame, metres."""
     side, frame = view
     tau = geometry.shutter.pixel_time(pixels, frame, side)
     world = inverse(geometry.rig.cam_from_world(geometry.motion, tau, side))
@@ -475,9 +476,9 @@ def looks(geometry: Geometry, view: View, pixels: FloatArray) -> tuple[FloatArra
 def seen_near(
     geometry: Geometry, view: View, points: FloatArray, near: FloatArray
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Pixels (n, 2) and times (n,) at which a frame sees points (n, 3), NaN for none, and what is not known.
+    """Return pixels (n, 2) and times (n,) of points (n, 3) in a frame, NaN for none, and a mask of unsolved ones.
 
-    Of a point that the readout passes twice, that which a search from pixels ``near`` (n, 2) finds.
+    If the readout sees a point twice, the result is the pixel that a search from the pixel ``near`` (n, 2) finds.
     """
     args = geometry.rig, geometry.shutter, geometry.motion, *view
     found = rs_project_near(*args, points, near[:, geometry.shutter.axis(view[0])])

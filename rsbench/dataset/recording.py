@@ -1,7 +1,8 @@
-"""A recording read from any layout: images, cameras, and as far as it says, times, poses, depth and disparity.
+"""A recording read from any layout: images, cameras and, if available, times, poses, depth and disparity.
 
-All in the conventions of rsbench: the centre of the top-left pixel is (0, 0), x right, y down, z forward, depth is
-z in the camera of the pixel's own row, poses are ``cam_from_world``. What a layout lacks is None or missing.
+The conventions are those of rsbench: the centre of the top-left pixel is (0, 0), x right, y down, z forward, depth
+is z in the camera frame of the pixel's row, poses are ``cam_from_world``. Data that a layout lacks are None or
+missing.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 
 PoseAt = Callable[[FloatArray], Pose]
-"""``cam_from_world`` (..., 3, 3), (..., 3) at times (...), frame periods; NaN where it is not known."""
+"""Returns ``cam_from_world`` (..., 3, 3), (..., 3) at times (...), frame periods; NaN if unknown."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,27 +33,27 @@ class Recording:
     """Shutters of the cameras whose readout is known; a global one has the ratio 0."""
     frame_period_s: float | None = None
     right_from_left: Pose | None = None
-    """``X_right = R X_left + t`` between the cameras as they are, each in its own axes."""
+    """``X_right = R X_left + t`` between the unrectified cameras, each in its own axes."""
     poses: Mapping[Side, PoseAt] = field(default_factory=dict)
     depths: Mapping[View, Callable[[], FloatArray]] = field(default_factory=dict)
-    """(H, W) z, metres, 0 where there is none; read on demand."""
+    """Read depth maps (H, W) on demand: z, metres, 0 if unknown."""
     disparities: Mapping[View, Callable[[], FloatArray]] = field(default_factory=dict)
-    """(H, W) px, such that ``fx baseline / disparity`` is z; NaN where there is none."""
+    """Read disparities (H, W) on demand, px: z is ``fx baseline / disparity``; NaN if unknown."""
     sightings: Mapping[View, Callable[[], tuple[FloatArray, FloatArray]]] = field(default_factory=dict)
-    """Pixels (n, 2) and the points (n, 3) of the world that the layout says are seen there."""
+    """Read pixels (n, 2) and the world points (n, 3) observed there, according to the layout."""
     truths: Mapping[tuple[Side, int, int], Path] = field(default_factory=dict)
-    """Images of a global shutter: of a camera, a frame, and the row at whose time it was taken."""
+    """Global-shutter images by camera, frame, and the row at whose time the image was taken."""
     masks: Mapping[View, Path] = field(default_factory=dict)
-    """Images with the weight of each pixel in the layout's own scores of a corrected frame; 0 is none."""
+    """Images with the weight of each pixel in the layout's own scores of a corrected frame; 0: ignored."""
     notes: tuple[str, ...] = ()
-    """What the layout leaves open, and how it was taken."""
+    """Assumptions made where the layout is ambiguous."""
 
     @property
     def rig(self) -> StereoRig | None:
-        """Both cameras as they are; None of one camera, or where their places are not known.
+        """The rig of both unrectified cameras; None for one camera or unknown extrinsics.
 
         Raises:
-            RsbenchError: the cameras cannot be a rig, such as two at one place.
+            RsbenchError: the cameras cannot form a rig, for instance because their centres coincide.
         """
         if self.right_from_left is None or set(self.cameras) != set(SIDES):
             return None
@@ -62,8 +63,7 @@ class Recording:
 
     @property
     def shutter(self) -> RollingShutter | None:
-        """The shutter of both cameras of the rig, each with its own ratio; None where a camera's readout is not
-        known."""
+        """The shutter of both cameras of the rig, each with its own readout ratio; None if one is unknown."""
         if self.rig is None or set(self.shutters) != set(SIDES):
             return None
         left, right = (self.shutters[side].readout_ratio for side in SIDES)
@@ -71,5 +71,5 @@ class Recording:
 
     @property
     def frames(self) -> int:
-        """Times at which there is an image."""
+        """Number of frames: one more than the largest frame number of the images."""
         return 1 + max((frame for _, frame in self.images), default=-1)

@@ -1,8 +1,8 @@
-"""Secret datasets: of a card, with scenes, motions, noise, order and names from a secret text.
+"""Secret datasets: variants of a card whose scenes, motions, noise, order and names follow from a secret text.
 
-Whoever has the text draws the same card again. What is drawn for one purpose reveals nothing of what is drawn for
-another, nor of the text: all are hashes of it, each with a word of its own before it. A text is announced by such
-a hash too, which is not the seed of anything.
+The same text always gives the same dataset. Each random value is a hash of the text prefixed by the value's
+purpose, so that it reveals nothing about other values or the text. The public commitment to a text is such a hash
+too, one that is not used as a seed.
 """
 
 from __future__ import annotations
@@ -21,44 +21,44 @@ from rsbench.scenes.load import read_scene_card
 from rsbench.storage.untrusted_files import read_text
 
 SHORTEST = 16
-"""Characters of a secret: shorter ones could be tried."""
+"""Smallest number of characters of a secret; shorter ones could be guessed by exhaustive search."""
 _LEAST = 0.7
-"""Smallest secret share of the card's rotation, translation and readout ratio: the card itself is public."""
+"""Smallest secret factor of the card's rotation, translation and readout ratio, as the card itself is public."""
 _BITS = 62
-"""Bits of a seed, which TOML and others store in 64 bits with a sign."""
+"""Number of bits of a seed: TOML and others store signed 64-bit integers."""
 _SEED = re.compile(r"^seed *=.*\n", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Secret:
-    """A text that nobody can guess."""
+    """A secret text from which random values are derived."""
 
     text: str = field(repr=False)
 
     def digest(self, *words: object) -> bytes:
-        """32 bytes for a purpose."""
+        """Return 32 pseudorandom bytes for a purpose."""
         purpose = "/".join(("rsbench", *map(str, words)))
         return hashlib.sha256(f"{purpose}\n{self.text}".encode()).digest()
 
     def number(self, *words: object) -> int:
-        """A seed for a purpose."""
+        """Return a seed for a purpose."""
         return int.from_bytes(self.digest("number", *words), "big") >> (256 - _BITS)
 
     def share(self, *words: object) -> float:
-        """A number in [0, 1) for a purpose."""
+        """Return a pseudorandom number in [0, 1) for a purpose."""
         return int.from_bytes(self.digest("share", *words)[:6], "big") / 2**48
 
     @property
     def commitment(self) -> str:
-        """Announces the text without telling it: SHA-256 in hex digits."""
+        """Public commitment to the text that does not reveal it: a SHA-256 in hex digits."""
         return self.digest("commitment").hex()
 
 
 def read_secret(path: Path) -> Secret:
-    """The text of a file, without white space around it.
+    """Read a secret from a text file, without surrounding white space.
 
     Raises:
-        RsbenchError: the file cannot be read, or its text is too short to be a secret.
+        RsbenchError: the file cannot be read, or its text is shorter than ``SHORTEST``.
     """
     text = read_text(path, 4096).strip()
     if len(text) < SHORTEST:
@@ -69,29 +69,29 @@ def read_secret(path: Path) -> Secret:
 
 
 def open_split(name_or_path: str, word: str) -> Secret:
-    """What a split of a name that all know is drawn from: the same for whoever names the same card and split."""
+    """Return the non-secret text of a public split; it depends only on the names of card and split."""
     return Secret(f"open split {word} of {card_path('datasets', name_or_path).stem}")
 
 
 def secret_card(
     name_or_path: str, secret: Secret, scenes: Path | None = None, *, split: str = "test", count: int | None = None
 ) -> DatasetCard:
-    """A card of which every sequence has a motion and noise of its own, and a name without meaning.
+    """Return a card in which every sequence has its own secret motion and noise, and an anonymous name.
 
-    Each combination of the card's sequences, grid and seeds is there, in a secret order. Sequences do not share a
-    motion, as they do in the card; rotation, translation and readout ratio are 0.7 to 1 times the card's.
+    It has each combination of the card's sequences, grid and seeds, in a secret order. Unlike in the card,
+    sequences do not share motions; rotation, translation and readout ratio are 0.7 to 1 times the card's.
 
     Args:
-        name_or_path: of a card whose motions are random.
-        secret: from which all is drawn.
-        scenes: folder of the scenes that ``write_scenes`` wrote; without it the card keeps the names of its own,
-            and is good for its motions alone.
-        split: what stands behind the name of the card.
-        count: sequences, in place of as many as the card has; beyond these the card is drawn again, with scenes of
-            its own.
+        name_or_path: name or path of a card with random motions.
+        secret: source of all random values.
+        scenes: folder with the scenes from ``write_scenes``; without it, the card keeps its own, public scenes, so
+            that only the motions are secret.
+        split: suffix of the name of the card.
+        count: number of sequences, by default that of the card; further ones repeat the card with new random
+            values and new scenes.
 
     Raises:
-        RsbenchError: the card cannot be read, or something that a split must hide is fixed in it.
+        RsbenchError: the card cannot be read, or it fixes something that a split must keep secret.
     """
     path = card_path("datasets", name_or_path)
     card = read_dataset_card(path)
@@ -112,12 +112,12 @@ def secret_card(
 
 
 def write_scenes(name_or_path: str, secret: Secret, folder: Path, count: int | None = None) -> list[Path]:
-    """Write the scene cards of a dataset card with secret seeds into a folder: other textures and other details.
+    """Write the scene cards of a dataset card into a folder, with secret seeds of textures and details.
 
-    ``count``: of sequences, as of ``secret_card``.
+    ``count`` is the number of sequences, as for ``secret_card``.
 
     Raises:
-        RsbenchError: a card cannot be read, or its scene is the same with any seed.
+        RsbenchError: a card cannot be read, or its scene does not depend on the seed.
     """
     dataset = read_dataset_card(card_path("datasets", name_or_path))
     cards, rounds = {_scene(each.scene) for each in dataset.sequence}, range(_rounds(dataset, count))
@@ -137,12 +137,12 @@ def write_scenes(name_or_path: str, secret: Secret, folder: Path, count: int | N
 
 
 def _rounds(card: DatasetCard, count: int | None) -> int:
-    """How often a card is drawn for so many sequences."""
+    """Return how often a card must be drawn for ``count`` sequences."""
     return 1 if count is None else -(-count // len(card.expanded().sequence))
 
 
 def _again(number: int) -> tuple[int, ...]:
-    """The key of a repeated draw of a card; the first draw has none, as if there were no others."""
+    """Return the key of draw ``number`` of a card; it is empty for the first draw, as without repeated draws."""
     return (number,) if number else ()
 
 
@@ -155,7 +155,7 @@ def _scene(name: str) -> Path:
 
 
 def _single(card: DatasetCard, secret: Secret, again: int) -> Iterator[DatasetCard]:
-    """The card with one sequence, combination of the grid and secret seed each; it was drawn ``again`` times."""
+    """Yield cards with one sequence, grid value and secret seed each; ``again`` is the number of the draw."""
     for sequence, number in product(card.sequence, range(max(len(card.seeds), 1))):
         for values in product(*(axis.items() for axis in card.grid.values())):
             labels = (label for label, _ in values)
@@ -167,14 +167,14 @@ def _single(card: DatasetCard, secret: Secret, again: int) -> Iterator[DatasetCa
 
 
 def _motion(single: DatasetCard) -> MotionCard | None:
-    """What the card says of the motion of its one sequence."""
+    """Return the motion that a card with one sequence states for it."""
     (sequence,) = single.sequence
     own = [value.motion for axis in single.grid.values() for value in axis.values() if value.motion is not None]
     return own[-1] if own else sequence.motion or single.motion
 
 
 def _drawn(single: DatasetCard, secret: Secret, again: tuple[int, ...]) -> SequenceCard:
-    """The one sequence of a card, drawn, of secret size; ValueError for what is not random."""
+    """Draw the only sequence of a card, with secret magnitudes; raise ValueError if its motion is not random."""
     stated = _motion(single)
     (sequence,) = single.expanded().sequence
     if stated is None or (stated.rotation_axis, stated.translation_axis) != ("random", "random"):

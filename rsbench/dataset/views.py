@@ -33,7 +33,7 @@ FAR = 1e7
 
 
 NUMBER, SHADED = 127, 128
-"""Bits of a label: the object's number; the pixel lies in the shadow of a moving object."""
+"""Bit masks of a label: the object's number, and the flag for pixels in the shadow of a moving object."""
 
 
 class PixelClass(IntEnum):
@@ -53,12 +53,12 @@ class PixelClass(IntEnum):
 
 
 def numbers_of(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Object numbers (...) of labels (...); 0: no moving object."""
+    """Return the object numbers (...) of labels (...); 0: no moving object."""
     return np.asarray(labels & NUMBER, dtype=np.uint8)
 
 
 def seen_from(geometry: Geometry, number: int) -> FixedGeometry:
-    """The geometry relative to a moving object, in whose frame its points are at rest; number 0: the world."""
+    """Return the geometry relative to a moving object, in whose frame its points are at rest; 0: the world."""
     motion = RelativeMotion(geometry.motion, geometry.objects[number - 1]) if number else geometry.motion
     return FixedGeometry(geometry.rig, geometry.shutter, motion, geometry.frames)
 
@@ -106,7 +106,7 @@ class ImageView(NamedTuple):
         return self._replace(side="right" if self.side == "left" else "left")
 
     def next_frame(self, frames: int) -> ImageView:
-        """The image of the next of ``frames`` frames; for the last frame, that of the previous one."""
+        """Return the image of the next of ``frames`` frames; for the last frame, that of the previous one."""
         return self._replace(frame=self.frame + (1 if self.frame < frames - 1 else -1))
 
     @property
@@ -127,18 +127,18 @@ Times = tuple[int, int]
 
 
 def image_views(times: Iterable[int]) -> tuple[ImageView, ...]:
-    """All views of these frames; global-shutter views are those of row 0."""
+    """Return all views of these frames; global-shutter views are those of row 0."""
     return tuple(ImageView(*each) for each in product(SHUTTERS, SIDES, times))
 
 
 def view_pairs(times: Times) -> tuple[tuple[ImageView, ImageView], ...]:
-    """All pairs of a view of two frames and one of its three partners."""
+    """Return all pairs of a view of two frames and one of its three partners."""
     both = image_views(times)
     return tuple((source, target) for source in both for target in source.partners() if target in both)
 
 
 def nearby_views(view: ImageView, frames: int) -> list[ImageView]:
-    """Other views of a sequence of ``frames`` frames, by distance in time, of at most ``_NEAREST`` frames."""
+    """Return the other views in the ``_NEAREST`` frames that are nearest in time, nearest first."""
     times = sorted(range(frames), key=lambda frame: abs(frame - view.frame))[:_NEAREST]
     return [each for time in times for each in image_views((time,)) if each != view]
 
@@ -148,7 +148,7 @@ IMAGE_VIEWS, VIEW_PAIRS = image_views(FRAMES), view_pairs(FRAMES)
 
 
 def times_at(geometry: Geometry, view: ImageView, pixels: FloatArray) -> FloatArray:
-    """Times (...) of pixels (..., 2) of a view, frame periods; the frame number for NaN."""
+    """Return the times (...) of pixels (..., 2) of a view, frame periods; the frame number for NaN."""
     if view.shutter == "gs":
         return np.broadcast_to(_time(geometry, view), pixels.shape[:-1])
     tau = geometry.shutter.pixel_time(pixels, view.frame, view.side)

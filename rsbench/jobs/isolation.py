@@ -72,7 +72,7 @@ Server = Callable[..., object]
 
 
 class EntryFailure(Exception):  # noqa: N818  not an error of rsbench
-    """Raised in a child for a fault of other people's code; the message is the reason."""
+    """Raised in a child for a fault of another package's code; the message is the reason."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,29 +111,29 @@ class IsolatedWorker:
     ) -> None:
         """
         Args:
-            factory: a function of a module of rsbench; called in the child with ``arguments``, returns what
-                answers the calls. Both raise ``EntryFailure`` where the entry is at fault.
-            arguments: picklable.
-            classes: the dataclasses that answers may hold.
-            environment: variables that the child has besides those of this process.
-            cancel: after it is set, possibly by another thread, calls end with ``Cancelled``.
-            memory_mb: limit of the child's memory; not applied where the system does not report its use.
+            factory: function of a module of rsbench that is called in the child with ``arguments`` and returns the
+                function that answers calls. Both raise ``EntryFailure`` for faults of the entry.
+            arguments: picklable arguments of the factory.
+            classes: dataclasses that answers may contain.
+            environment: environment variables of the child in addition to those of this process.
+            cancel: event that ends calls with ``Cancelled`` once it is set, possibly by another thread.
+            memory_mb: limit of the child's memory; not applied if the system does not report its use.
         """
         self._memory_mb = memory_mb
         self._start = (factory, arguments)
         self._classes = {cls.__name__: cls for cls in classes}
         self._environment = {**os.environ, **(environment or {})}
         self.cancel = cancel or threading.Event()
-        """See the argument; it may be replaced between calls."""
+        """The argument ``cancel``; it may be replaced between calls."""
         self._child: _Child | None = None
         self._one_call = threading.Lock()
 
     def call(self, *arguments: object, limit_s: float) -> Outcome:
-        """The child's answer, or the reason of a failure.
+        """Call the child and return its answer, or the reason of a failure.
 
         Raises:
-            RuntimeError: rsbench's own code in the child is at fault.
-            Cancelled: see ``cancel``.
+            RuntimeError: rsbench's own code in the child raised an exception.
+            Cancelled: the event ``cancel`` is set.
         """
         with self._one_call:  # answers to two calls would be mixed up
             try:
@@ -147,7 +147,7 @@ class IsolatedWorker:
                         return replace(started, reason=f"did not start: {started.reason}")
                 return self._exchange(arguments, limit_s)
             except BaseException:
-                self.close()  # its answer must not be taken for that of the next call
+                self.close()  # a late answer must not be read by the next call
                 raise
 
     def close(self) -> None:
@@ -177,7 +177,7 @@ class IsolatedWorker:
         return Outcome(value=value, reason=reason, output=child.output, ended=ended)
 
     def _read(self, data: bytes) -> tuple[Any, str]:
-        """Value and reason of a message of the child."""
+        """Decode a message of the child to an answer and a reason of failure."""
         try:
             message = decode(data, self._classes)
         except ValueError as error:
@@ -191,11 +191,11 @@ class IsolatedWorker:
 
 
 class _Child:
-    """The process, its pipes, and the threads that read them."""
+    """A child process with its pipes and the threads that read them."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         self.overdue = False
-        """Whether an answer did not come in time, or took too much memory."""
+        """Whether a call exceeded its limit of time or memory."""
         self._printed = b""
         path = json.dumps([str(entry) for entry in sys.path])
         with contextlib.ExitStack() as stack:
@@ -220,7 +220,7 @@ class _Child:
     def exchange(
         self, request: bytes, limit_s: float, cancel: threading.Event, memory_mb: float | None
     ) -> tuple[bytes | None, str]:
-        """The answer to a request, or None and the reason."""
+        """Send a request and return the answer, or None and the reason."""
         # A child that does not read must not block its parent.
         threading.Thread(target=self._send, args=(request,), daemon=True).start()
         end = time.monotonic() + limit_s
@@ -243,7 +243,7 @@ class _Child:
         return None, f"took longer than {limit_s:g} s"
 
     def _used_mb(self) -> float:
-        """Memory of the process, MB; 0 where the system does not report it."""
+        """Return the memory of the process, MB, or 0 if the system does not report it."""
         try:
             with open(f"/proc/{self._process.pid}/statm", "rb") as file:
                 pages = int(file.read().split()[1])
@@ -252,7 +252,7 @@ class _Child:
         return pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
 
     def kill(self) -> None:
-        """End the process and its group, and wait for that."""
+        """Kill the process and its group, and wait until it has ended."""
         kill_group(self._process)
         self._process.wait()
         self._lifeline.close()
@@ -266,12 +266,12 @@ class _Child:
                 self._process.stdin.close()
 
     def _ending(self) -> str:
-        """How the process ended; waits for at most a second."""
+        """Describe how the process ended; wait for at most a second."""
         try:
             code = self._process.wait(1.0)
         except subprocess.TimeoutExpired:
             return "closed its connection"
-        self._readers[1].join(_POLL_S)  # its last words
+        self._readers[1].join(_POLL_S)  # its last output
         return ending(code)
 
     def _send(self, request: bytes) -> None:
@@ -294,7 +294,7 @@ class _Child:
 
 
 def one_line(error: BaseException) -> str:
-    """An exception in one short line."""
+    """Describe an exception in one short line."""
     return _short(exception_text(error))
 
 
@@ -307,10 +307,10 @@ def _short(text: str) -> str:
 
 
 def encode(value: object) -> bytes:
-    """A value as bytes.
+    """Encode a value as bytes.
 
     Raises:
-        TypeError: it holds something that is not plain data.
+        TypeError: the value contains something other than plain data.
     """
     arrays: list[NDArray[Any]] = []
     text = json.dumps(_flat(value, arrays))
@@ -321,10 +321,10 @@ def encode(value: object) -> bytes:
 
 
 def decode(data: bytes, classes: Mapping[str, type]) -> Any:
-    """The value that ``encode`` was given; dataclasses must be in ``classes`` and are made by their constructors.
+    """Decode a value from ``encode``; dataclasses must be in ``classes`` and are created by their constructors.
 
     Raises:
-        ValueError: the bytes are not such a value, or a constructor refuses its fields.
+        ValueError: the bytes are not an encoded value, or a constructor refuses its fields.
     """
     try:
         arrays = unpack_arrays(io.BytesIO(data), "message", limit=len(data))  # ``encode`` compresses nothing
@@ -376,7 +376,7 @@ def send(stream: BinaryIO, data: bytes) -> None:
 
 
 def receive(stream: BinaryIO) -> bytes | None:
-    """The next message; None at the end of the stream or for anything else."""
+    """Read the next message; return None at the end of the stream or for invalid data."""
     head = stream.read(_LENGTH_BYTES)
     length = int.from_bytes(head, "big")
     if len(head) < _LENGTH_BYTES or length >= _LONGEST_BYTES:
@@ -396,9 +396,9 @@ def use_one_thread() -> None:
 
 
 def serve_parent(lifeline: int) -> NoReturn:
-    """Answer the parent until it is gone."""
+    """Answer requests of the parent until it ends."""
     if lifeline >= 0:
-        end_with(lifeline)  # elsewhere than on Linux ``_listen`` does it, as soon as Python runs
+        end_with(lifeline)  # on systems other than Linux, ``_listen`` ends the child
     import_untried()
     requests, answers = _take_streams()
     waiting: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -425,7 +425,7 @@ def _start(factory: Callable[..., Server], arguments: tuple[object, ...]) -> Ser
 
 
 def _take_streams() -> tuple[BinaryIO, BinaryIO]:
-    """Streams to the parent, apart from standard input and output, which other code may use."""
+    """Return private streams to the parent, and redirect standard input and output for other code."""
     requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)

@@ -1,9 +1,9 @@
-"""Many independent jobs in child processes that can be stopped at once, on this machine or on a Dask cluster.
+"""Runs independent jobs in child processes that can be stopped at once, on this machine or on a Dask cluster.
 
-The cluster is the extra ``rsbench[cluster]``; nothing else imports distributed. A task of the cluster is one job,
-done in a child process of the machine's worker as it would be here: a crash ends that child alone, and the job is
-tried again there. The scheduler gives the jobs of a worker that dies to others. When the run ends, is stopped or
-dies, so do the children that work for it.
+The cluster needs the extra ``rsbench[cluster]``; no other module imports distributed. Each task of the cluster is
+one job, which a Dask worker runs in a child process, as on this machine: a crash ends only that child, and the job
+is tried again there. The scheduler reassigns the jobs of a worker that dies. When the run ends, is stopped or
+dies, its child processes end too.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rsbench.jobs.isolation import Cancelled, IsolatedWorker, Outcome, Server
 
 Job = TypeVar("Job")
 TRIES = 3
-"""Tries of a job whose process ended by itself or was killed by others."""
+"""Number of tries of a job whose process ended by itself or was killed from outside."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,12 +36,12 @@ class Cluster:
 
 
 Workers = int | Cluster
-"""Processes on this machine, or a cluster."""
+"""Number of processes on this machine, or a cluster."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerProcesses:
-    """How to start the child processes of one run; picklable."""
+    """Settings for starting the child processes of one run; picklable."""
 
     factory: Callable[..., Server]
     arguments: tuple[object, ...]
@@ -50,7 +50,7 @@ class WorkerProcesses:
     tries: int
 
     def hire(self, cancel: threading.Event) -> IsolatedWorker:
-        """One child; ``cancel`` stops it."""
+        """Create a worker with its own child process; ``cancel`` stops it."""
         return IsolatedWorker(
             self.factory,
             *self.arguments,
@@ -60,7 +60,7 @@ class WorkerProcesses:
         )
 
     def done_by(self, worker: IsolatedWorker, job: object, limit_s: float = math.inf) -> Outcome:
-        """A job by one of the workers, tried again where its process ended."""
+        """Run a job on one of the workers; if its process ends, try again, up to ``tries`` times in total."""
         for _ in range(self.tries - 1):
             if not (outcome := worker.call(job, limit_s=limit_s)).ended:
                 return outcome
@@ -68,13 +68,13 @@ class WorkerProcesses:
 
 
 _MOST_LOST = 10
-"""Lost jobs after which the next ones are not tried: each costs the start of two processes."""
+"""Number of lost jobs after which the run stops: each of them costs the start of two processes."""
 _NAMED = 3
 _Finished = tuple[Job, Outcome | BaseException]
 
 
 class LostJobsError(RsbenchError):
-    """The process of some jobs ended at every try; results of the others are kept."""
+    """Raised if the process of some jobs ended at every try; results of the other jobs are kept."""
 
     exit_code = 1
 
@@ -87,11 +87,11 @@ def finished_jobs(
     *arguments: object,
     name: Callable[[Job], str] = str,
 ) -> Generator[tuple[Job, Any], None, None]:
-    """Jobs with their answers, see ``run_jobs``; ``name`` names a job in errors.
+    """Yield jobs with their answers, see ``run_jobs``; ``name`` returns the name of a job for errors.
 
     Raises:
-        LostJobsError: names jobs whose process ended ``TRIES`` times, once the others are done or many are lost.
-        RsbenchError: at once, for a job that failed.
+        LostJobsError: the process of some jobs ended ``TRIES`` times; raised after the other jobs, or after many.
+        RsbenchError: a job failed; raised at once.
     """
     lost = []
     with closing(run_jobs(factory, jobs, workers, environment, *arguments)) as outcomes:
@@ -121,23 +121,23 @@ def run_jobs(
     seconds_of: Callable[[Job], float] | None = None,
     memory_mb: float | None = None,
 ) -> Generator[tuple[Job, Outcome], None, None]:
-    """Jobs with their outcomes, as they become ready.
+    """Run jobs and yield them with their outcomes as they become ready.
 
-    A job whose process ended is tried ``TRIES`` times in fresh processes, or once where there are limits. When the
+    A job whose process ended is tried ``TRIES`` times in fresh processes, or once if there are limits. When the
     iterator is closed or an exception such as Ctrl-C passes through it, waiting jobs are dropped and all processes
     end at once.
 
     Args:
-        factory: see ``IsolatedWorker``; what it returns is called with a job.
-        jobs: picklable.
-        workers: processes, or a cluster.
+        factory: see ``IsolatedWorker``; the function that it returns is called with a job.
+        jobs: picklable jobs.
+        workers: number of processes, or a cluster.
         environment, arguments: see ``IsolatedWorker``.
-        seconds_of: time limit of a job, perhaps infinite; None for no limits.
-        memory_mb: of a process; see ``IsolatedWorker``.
+        seconds_of: returns the time limit of a job, possibly infinite; None for no limits.
+        memory_mb: limit of the memory of a process, see ``IsolatedWorker``.
 
     Raises:
         RsbenchError: the cluster cannot be reached.
-        RuntimeError: rsbench's own code in a child is at fault.
+        RuntimeError: rsbench's own code in a child raised an exception.
     """
     processes = WorkerProcesses(
         factory=factory,
@@ -162,7 +162,7 @@ def _run_here(
         waiting.put(job)
 
     def work() -> None:
-        """Let a process do jobs until none is left."""
+        """Run jobs in one child process until none is left."""
         with processes.hire(cancel) as worker, contextlib.suppress(queue.Empty, Cancelled):
             while True:
                 job = waiting.get_nowait()
@@ -198,11 +198,11 @@ _WATCH_S = 0.5
 def run_on_cluster(
     cluster: Cluster, processes: WorkerProcesses, jobs: Sequence[Job], seconds_of: Callable[[Job], float] | None
 ) -> Generator[tuple[Job, Outcome], None, None]:
-    """Jobs with their outcomes, as they become ready; see ``run_jobs``.
+    """Run jobs on a cluster and yield them with their outcomes as they become ready; see ``run_jobs``.
 
     Raises:
         RsbenchError: there is no such scheduler, it has no worker, or distributed is not installed.
-        RuntimeError: rsbench's own code in a child is at fault.
+        RuntimeError: rsbench's own code in a child raised an exception.
     """
     content = bytes(ForkingPickler.dumps(processes))
     key = hashlib.sha256(content).hexdigest()
@@ -210,7 +210,7 @@ def run_on_cluster(
         from distributed import CancelledError, KilledWorker, as_completed
 
         try:
-            # A task of its own: it is sent to each worker once, and repeated where all workers that had it died.
+            # A separate task: its result is sent to each worker once, and repeated if all holders of it die.
             shared = client.submit(bytes, content, key=f"rsbench-workers-{key[:16]}")
             futures = {}
             for job in jobs:
@@ -218,7 +218,7 @@ def run_on_cluster(
                 futures[client.submit(_do, key, shared, job, limit, pure=False)] = job
             for future in as_completed(list(futures)):
                 job = futures.pop(future)
-                try:  # waits again where a worker dies with the result: the scheduler repeats the task
+                try:  # if a worker dies with the result, this waits until the scheduler has repeated the task
                     outcome = future.result()
                 except KilledWorker as error:
                     reason = f"workers of the cluster died: {error.last_worker.address}"
@@ -240,7 +240,7 @@ def run_on_cluster(
 
 @contextlib.contextmanager
 def _connected(cluster: Cluster) -> Iterator[Any]:
-    """A client of the scheduler, for as long as the context is open."""
+    """Open a client of the scheduler for the duration of the context."""
     try:
         from distributed import Client
     except ImportError as error:
@@ -273,7 +273,7 @@ _IDLE_LOCK = threading.Lock()
 
 
 def _take(key: str, content: bytes, cancel: threading.Event) -> tuple[WorkerProcesses, IsolatedWorker]:
-    """An idle child of a run, or a new one, for one job, which ``cancel`` stops; children of other runs end."""
+    """Take an idle child of a run, or start one; end idle children of other runs. ``cancel`` stops its job."""
     with _IDLE_LOCK:
         others = [worker for name in list(_IDLE) if name != key for _, worker in _IDLE.pop(name)]
         own = _IDLE.get(key, [])
@@ -288,7 +288,7 @@ def _take(key: str, content: bytes, cancel: threading.Event) -> tuple[WorkerProc
 
 
 def _dismiss(key: str) -> None:
-    """End the idle children of a run; those at work end when their task is cancelled."""
+    """End the idle children of a run; busy ones end when their task is cancelled."""
     with _IDLE_LOCK:
         idle = _IDLE.pop(key, [])
     for _, worker in idle:
@@ -296,14 +296,14 @@ def _dismiss(key: str) -> None:
 
 
 def _do(key: str, content: bytes, job: object, limit_s: float) -> Outcome:
-    """One job in a child of this worker of the cluster.
+    """Run one job in a child process of this Dask worker.
 
     Raises:
         distributed.Reschedule: the job was stopped. If the scheduler still needs it, it repeats the task.
     """
     from distributed import Reschedule
 
-    cancel = threading.Event()  # of this job alone: the watch may set it when the child already does the next one
+    cancel = threading.Event()  # one per job: the watch may set it when the child already runs the next job
     processes, worker = _take(key, content, cancel)
     with _watched(cancel):
         try:
@@ -320,7 +320,7 @@ def _do(key: str, content: bytes, job: object, limit_s: float) -> Outcome:
 
 @contextlib.contextmanager
 def _watched(cancel: threading.Event) -> Iterator[None]:
-    """Set an event when the scheduler no longer needs the task of this thread: its run was stopped, or died."""
+    """Set ``cancel`` when the scheduler no longer needs this thread's task, because its run stopped or died."""
     from distributed import get_worker
 
     worker = get_worker()

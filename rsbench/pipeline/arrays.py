@@ -1,4 +1,4 @@
-"""Correction of arrays, as ``rsbench.correct`` does it: a stereo rig's four images, or one camera's in order."""
+"""Implementation of ``rsbench.correct`` and ``rsbench.estimate_trajectory``, whose images are arrays."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def options_of(
     corrector: str | Path,
     **others: Any,
 ) -> CorrectionOptions:
-    """Options with these components, by name or card; RsbenchError where there is none of a name."""
+    """Return the options with components given by name or card. Raises RsbenchError for an unknown name."""
     entry = entry_of(solver)
     for name, value in (("matcher", matcher), ("features", features), ("corrector", corrector)):
         arguments.name_or_path(name, value)
@@ -71,9 +71,9 @@ def of_rig(
     *,
     close: bool = False,
 ) -> CorrectedFrames:
-    """Four images left 0, right 0, left 1, right 1, corrected; errors as of ``rsbench.correct``.
+    """Correct the images left 0, right 0, left 1, right 1 of a rig. Raises as ``rsbench.correct`` does.
 
-    ``close``: narrow holes too.
+    ``close``: whether to close narrow holes.
     """
     check_times(inputs.readout_ratio, options.target_row, rig)
     views, known = four_images(images, rig), Given(gyro=gyro_samples(gyro))
@@ -95,7 +95,7 @@ def of_one_camera(
     gyro: ArrayLike | None = None,
     gyro_clock_error: float = 0.0,
 ) -> list[Fused]:
-    """Images of one camera in order, corrected; errors as of ``rsbench.correct``."""
+    """Correct the images of one camera, which are in order. Raises as ``rsbench.correct`` does."""
     known = StereoRig.of_one(camera) if isinstance(camera, PinholeCamera) else None
     for number, image in enumerate(arguments.items("images", images)):
         check_image(f"frame {number}", image, known)
@@ -105,7 +105,7 @@ def of_one_camera(
     if readout_ratio is not None:
         arguments.check_number("readout_ratio", readout_ratio, 0.0, 1.0)
     if camera is not None and not isinstance(camera, PinholeCamera):
-        arguments.check_number("camera", camera)  # degrees, whose range the card of a camera checks
+        arguments.check_number("camera", camera)  # degrees; OneCameraCard checks the range
     samples = gyro_samples(gyro)
     log = None if samples is None else Gyroscope(samples=samples, clock_error=gyro_clock_error)
     options, sources = options_of_camera(inpaint, seed, target_row), [ImageSource(images)]
@@ -114,15 +114,15 @@ def of_one_camera(
     return [finished(fused) for fused in frames] if inpaint is None else frames
 
 
-# The trajectory of arrays, as ``rsbench.estimate_trajectory`` finds it.
+# Implementation of ``rsbench.estimate_trajectory``.
 
 
 def matches_of(frames: Sequence[Any], rig: StereoRig, features: str) -> list[Correspondences]:
-    """Matches of each two successive frame times; frames are (left, right) images.
+    """Match each two successive frame times; ``frames`` are pairs (left, right) of images.
 
     Raises:
-        ValueError: a time does not have two images, their size is not the rig's, or there is only one time.
-        RsbenchError: there is no such feature matcher.
+        ValueError: a time does not have two images of the rig's size, or there are fewer than two times.
+        RsbenchError: the feature matcher does not exist.
     """
     options = CorrectionOptions(features=load_features(features))
     for number, both in enumerate(frames):
@@ -142,11 +142,11 @@ def trajectory_of(
     seed: int,
     gyro: FloatArray | None = None,
 ) -> Trajectory:
-    """The trajectory, and the shutter where that is not known.
+    """Estimate the trajectory, and the shutter if it is None.
 
     Raises:
-        ValueError: no tracks; without a shutter, too few frames; samples of a gyroscope of another time.
-        NoMotionError: the matches do not tell the shutter, or no trajectory explains them.
+        ValueError: no tracks; too few frames to estimate the shutter; gyroscope samples outside the frames' times.
+        NoMotionError: the matches do not determine the shutter, or no trajectory explains them.
     """
     if shutter is None and len(windows) + 1 < FEWEST_FRAMES:
         raise ValueError(f"shutter: is found of {FEWEST_FRAMES} frames and more; these are {len(windows) + 1}")

@@ -327,7 +327,7 @@ of slow traffic; and 0.53 to 0.95 on others, of which motion or convergence are 
 def _credible(
     frames: dict[View, Fused], problem: CorrectionProblem, options: CorrectionOptions
 ) -> dict[View, Fused]:
-    """The frames; those of a motion that does not explain the images are corrected by each camera alone."""
+    """Return the frames; if the motion does not explain the images, correct them by each camera alone instead."""
     return {
         view: _by_one_camera(problem, view, fused.explained, options) if fused.explained < _CREDIBLE else fused
         for view, fused in frames.items()
@@ -335,7 +335,7 @@ def _credible(
 
 
 def _by_one_camera(problem: CorrectionProblem, view: View, explained: float, options: CorrectionOptions) -> Fused:
-    """A frame corrected by the frames of its own camera, without depth; as read if these cannot be corrected."""
+    """Correct a frame by the frames of its own camera, without depth; if that fails, return it uncorrected."""
     (side, frame), shutter, camera = view, problem.shutter, problem.rig.sensor(view[0])
     ratio, lines = shutter.ratio_of(side), shutter.lines(side)
     row = float(problem.target_time(view) - shutter.start(frame, side)) * lines / ratio if ratio else 0.0

@@ -1,4 +1,4 @@
-"""Starting Mitsuba: which variant this process renders with, chosen once and never at the cost of a crash."""
+"""Starts Mitsuba with a variant that is chosen once per process and tested in a child process first."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ print("version", *dr.detail.cuda_version())
 
 @dataclass(frozen=True, kw_only=True)
 class Backend:
-    """How this process renders."""
+    """The renderer backend of this process."""
 
     variant: str
     """Mitsuba variant: ``llvm_ad_rgb``, ``cuda_ad_rgb`` or ``scalar_rgb``."""
     llvm_path: Path | None = None
     llvm_version: str | None = None
     message: str | None = None
-    """One line for the user when the choice needs one (a slow fallback and its remedy), else None."""
+    """One line for the user if the choice needs an explanation (a slow fallback and its remedy), else None."""
 
 
 _started: Backend | None = None
@@ -59,10 +59,10 @@ _lock = threading.RLock()
 def start_backend(preference: Preference = "auto") -> Backend:
     """Choose the Mitsuba variant of this process and start it; later calls return the same answer.
 
-    ``auto`` takes LLVM (the same bits on every machine of a kind), then CUDA, then the slow scalar variant;
-    ``cuda`` takes what ``auto`` would where no GPU can trace, and says so in the message. The environment variable
-    ``RSBENCH_VARIANT`` overrides ``preference``; ``DRJIT_LIBLLVM_PATH`` names the one libLLVM
-    to try. Every library is tried in a child process first, so an unsuitable one cannot end this process.
+    ``auto`` tries LLVM (the same bits on every machine of a kind), then CUDA, then the slow scalar variant.
+    ``cuda`` falls back to ``auto`` if no GPU can trace rays, and reports this in the message. The environment
+    variable ``RSBENCH_VARIANT`` overrides ``preference``; ``DRJIT_LIBLLVM_PATH`` names the only libLLVM to try.
+    Every library is tried in a child process first, so an unsuitable one cannot end this process.
 
     Raises:
         RsbenchError: unknown preference; ``llvm`` does not work here; another backend has already been started in
@@ -89,10 +89,10 @@ def start_backend(preference: Preference = "auto") -> Backend:
 
 
 def ask_for(name: str | None) -> None:
-    """Have this process, and those that it starts, render with a backend; with None, as the environment says.
+    """Set the backend of this process and its children; None leaves the choice to the environment.
 
     Raises:
-        RsbenchError: no such backend.
+        RsbenchError: there is no such backend.
     """
     if name is not None and name not in VARIANTS:
         raise RsbenchError(f"--backend {name}: allowed are {', '.join(VARIANTS)}")
@@ -101,7 +101,7 @@ def ask_for(name: str | None) -> None:
 
 
 def _check_working_folder() -> None:
-    """Without one Mitsuba ends the process as it is imported."""
+    """Check that the working folder exists: otherwise the import of Mitsuba ends the process."""
     try:
         os.getcwd()
     except OSError as error:
@@ -149,7 +149,7 @@ def _choose(wanted: Preference) -> tuple[Backend, llvm.Candidate | None]:
 
 
 def _adopted() -> tuple[Backend, None] | None:
-    """The variant that the user's own program set before us, if it did."""
+    """Return the variant that the user's program has already set, if any."""
     mitsuba = sys.modules.get("mitsuba")
     variant = mitsuba.variant() if mitsuba is not None else None
     if variant is None:
@@ -164,7 +164,7 @@ def _adopted() -> tuple[Backend, None] | None:
 
 
 def _check_loaded() -> None:
-    """Dr.Jit looks for LLVM once, as it is imported."""
+    """Check that Dr.Jit, if already imported, has found LLVM: it searches only once, on import."""
     drjit = sys.modules.get("drjit")
     version = drjit.detail.llvm_version() if drjit is not None else (llvm.MINIMUM_VERSION,)
     if version[0] < llvm.MINIMUM_VERSION:
@@ -198,7 +198,7 @@ def set_threads(count: int) -> None:
 
 
 def driver_library() -> Path | None:
-    """The NVIDIA driver's library, looked for by name alone: nothing is loaded or started."""
+    """Find the NVIDIA driver's library by file name, without loading it."""
     folders = [part for part in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep) if part]
     patterns = [*_DRIVER_GLOBS, *(f"{glob.escape(folder)}/libcuda.so*" for folder in folders)]
     if sys.platform == "win32":
@@ -207,7 +207,7 @@ def driver_library() -> Path | None:
 
 
 def probe_cuda(timeout: float = 120.0) -> llvm.ProbeResult:
-    """Whether ``cuda_ad_rgb`` can trace a ray here; costs nothing on a machine without an NVIDIA driver."""
+    """Test whether ``cuda_ad_rgb`` can trace rays here; without an NVIDIA driver, no process is started."""
     driver = driver_library()
     if driver is None:
         return llvm.ProbeResult(ok=False, reason="no NVIDIA driver on this machine")

@@ -1,4 +1,4 @@
-"""Diagnosis of what this machine can render with: everything that may break is tried in a child process."""
+"""Diagnosis of the rendering backends on this machine; everything that may crash is tried in a child process."""
 
 from __future__ import annotations
 
@@ -68,9 +68,9 @@ class DoctorRow:
 
 
 def doctor_report() -> list[DoctorRow]:
-    """Rows about Python, packages, the processor, every LLVM and variant tried, and the image libraries.
+    """Return rows about Python, packages, the processor, every LLVM and variant tried, and the image libraries.
 
-    Never raises and never loads a doubtful library: a check that itself breaks becomes a row that says so.
+    It never raises and never loads an untested library; a check that raises becomes a row with the error.
     """
     rows: list[DoctorRow] = []
     checks: tuple[tuple[str, Callable[[], Iterator[DoctorRow]]], ...] = (
@@ -84,16 +84,16 @@ def doctor_report() -> list[DoctorRow]:
     for name, check in checks:
         try:
             rows.extend(check())
-        except Exception as error:  # a doctor must outlive whatever is ill
+        except Exception as error:  # the other checks must still run
             rows.append(DoctorRow(name, "fail", f"check broke: {type(error).__name__}: {error}"))
     return rows
 
 
 def advice(rows: Sequence[DoctorRow]) -> list[str]:
-    """What to do on this machine, a line each; the last says with what it renders.
+    """Return advice for this machine, one line each; the last line names the backend that will be used.
 
     Args:
-        rows: of ``doctor_report``.
+        rows: rows from ``doctor_report``.
     """
     found = {row.component: row for row in rows}
     lines = []

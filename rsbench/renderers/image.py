@@ -1,12 +1,13 @@
 """From linear radiance to the 8-bit images of a dataset: sRGB, sensor noise, mosaic, JPEG.
 
-The linear model of EMVA 1288 (release 4.0, section 2): light and dark current free a Poisson number of electrons,
-read-out adds Gaussian noise, the gain makes digital numbers of them, which are rounded and clipped. In electrons
-the variance of a pixel is ``mean + dark + read_noise^2 + step^2 / 12``, with ``step`` electrons to a number.
+The noise model is the linear one of EMVA 1288 (release 4.0, section 2): light and dark current generate a
+Poisson-distributed number of electrons, read-out adds Gaussian noise, and the gain converts electrons to digital
+numbers, which are rounded and clipped. The variance of a pixel, in electrons squared, is
+``mean + dark + read_noise^2 + step^2 / 12``, where ``step`` is the number of electrons per digital number.
 
-A mosaic is interpolated by OpenCV's edge-aware demosaicing (``COLOR_Bayer..2RGB_EA``) of linear 16-bit numbers: a
-green value is the mean of its two neighbours in the direction in which they differ less, a red or blue one that of
-the two or four nearest. JPEG is OpenCV's too (libjpeg-turbo), with colours of half the resolution (4:2:0).
+OpenCV's edge-aware demosaicing (``COLOR_Bayer..2RGB_EA``) interpolates a mosaic, as linear 16-bit numbers: a green
+value is the mean of its two neighbours in the direction in which they differ less, a red or blue one the mean of
+the two or four nearest. OpenCV (libjpeg-turbo) also compresses JPEG, with chroma at half resolution (4:2:0).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from rsbench.scenes.model import linear_to_srgb, srgb_to_linear
 
 Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 _MOSAIC_BITS = 16
-"""Bits of a mosaic's readings where numbers are not rounded: demosaicing needs whole numbers."""
+"""Bit depth of a mosaic without a given ``bit_depth``: demosaicing needs whole numbers."""
 _BLACK_SHARE = 1 / 16
 """Share of the digital range below black, so that noise in the dark is not clipped there."""
 _RANGES: dict[str, tuple[float, float]] = {
@@ -46,7 +47,7 @@ _RANGES |= {f"right_{name}": _RANGES[name] for name in _BY_CAMERA if name in _RA
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """Exposure and noise of an image sensor; the defaults are those of an ideal one: nothing.
+    """Exposure and noise of an image sensor; the defaults describe an ideal sensor without any effect.
 
     Raises:
         ValueError: a value is out of its range.
@@ -63,23 +64,22 @@ class Sensor:
     read_noise: float = 0.0
     """Standard deviation of the noise of reading a pixel, electrons."""
     dark_current: float = 0.0
-    """Electrons per second without light; the camera subtracts its mean, its noise stays."""
+    """Electrons per second without light; the camera subtracts their mean, but their noise remains."""
     bit_depth: int = 0
     """Bits of the digital numbers; 0: they are not rounded."""
     vignetting: float = 0.0
     """Share of the light that the corners lose; it grows with the square of the distance from the centre."""
     brightness: tuple[float, ...] = (1.0, 1.0)
-    """Brightness of each frame over that of the clean twin: what an automatic exposure does from frame to
-    frame."""
+    """Brightness of each frame, relative to the image of an ideal sensor; it simulates automatic exposure."""
     right_brightness: float = 1.0
-    """Brightness of the right camera over the left one."""
+    """Brightness of the right camera, relative to the left one."""
     right_exposure_s: float | None = None
     """Exposure of the right camera, seconds. Absent: as the left camera's."""
     right_gain: float | None = None
     """Gain of the right camera. Absent: as the left camera's."""
     mosaic: Mosaic = "none"
-    """Colour filters before the first two pixels of the first two rows, repeated over the image; "none": each
-    pixel measures all three colours."""
+    """Colour filters of the first two pixels of the first two rows, repeated over the image; "none": each pixel
+    measures all three colours."""
     right_mosaic: Mosaic | None = None
     """Colour filters of the right camera. Absent: as the left camera's."""
     jpeg_quality: int = 0
@@ -101,13 +101,13 @@ class Sensor:
 
     @property
     def noiseless(self) -> Sensor:
-        """The same exposure, fall-off and brightness without noise, rounding, mosaic and compression."""
+        """The sensor with the same exposure, vignetting and brightness, but no noise, rounding, mosaic or JPEG."""
         clean: dict[str, Any] = {"photon_noise": False, "read_noise": 0.0, "dark_current": 0.0, "bit_depth": 0}
         clean |= {"mosaic": "none", "jpeg_quality": 0, "right_mosaic": None, "right_jpeg_quality": None}
         return replace(self, **clean)
 
     def of(self, side: str, frame: int) -> Sensor:
-        """The sensor of one camera at one time, both of whose frames and cameras are alike."""
+        """Return the sensor of one camera in one frame, as a ``Sensor`` whose two cameras and frames are equal."""
         right = side == "right"
         own: dict[str, Any] = {name: getattr(self, f"right_{name}") if right else None for name in _BY_CAMERA}
         light = (self.brightness[frame] if self.scripted else 1.0) * (self.right_brightness if right else 1.0)
@@ -117,29 +117,29 @@ class Sensor:
 
     @property
     def scripted(self) -> bool:
-        """Whether frames differ in brightness, which is then that of each."""
+        """Whether ``brightness`` is set, so that it has one value for each frame."""
         return self.brightness != _DEFAULTS["brightness"]
 
     @property
     def longest_s(self) -> float:
-        """Seconds of the longer exposure of the two cameras."""
+        """The longer exposure time of the two cameras, seconds."""
         return max(self.exposure_s, self.right_exposure_s or 0.0)
 
     @property
     def record(self) -> dict[str, Any]:
-        """Values for JSON; keys that were added later are left out at their defaults."""
+        """Values for JSON, without keys added in later versions that have their defaults."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         own = {name: value for name, value in values.items() if name not in _DEFAULTS or value != _DEFAULTS[name]}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
 
     @property
     def white(self) -> float:
-        """Electrons of white."""
+        """Number of electrons of a white pixel."""
         return self.full_well / self.gain
 
     @property
     def bits(self) -> int:
-        """Bits of the digital numbers; 0 if values are not quantised."""
+        """Number of bits of the digital numbers; 0 if values are not quantised."""
         return self.bit_depth or (0 if self.mosaic == "none" else _MOSAIC_BITS)
 
     @property
@@ -149,9 +149,9 @@ class Sensor:
         return round(_BLACK_SHARE * top), top
 
     def variance(self, light: ArrayLike) -> NDArray[np.float64]:
-        """Noise variance of linear values (...), white = 1, under light ``light``, away from black and white.
+        """Return the noise variance of linear values ``light`` (...), white = 1, far from clipping.
 
-        It applies to raw pixels, before demosaicing and compression.
+        It is the variance of raw pixels, before demosaicing and compression.
         """
         black, top = self.levels
         dark = self.dark_current * self.exposure_s
@@ -167,24 +167,27 @@ _DEFAULTS = {
     "jpeg_quality": 0,
     **{f"right_{name}": None for name in _BY_CAMERA},
 }
-"""Values with which records leave a key out: there is no such effect."""
+"""Values at which ``Sensor.record`` omits a key, because the effect is absent."""
 
 
 def filters(mosaic: Mosaic, width: int, rows: ArrayLike) -> NDArray[np.intp]:
-    """Channels (n, width), 0 to 2, of the filters before the pixels of rows (n)."""
+    """Return the colour channel (n, width), 0 to 2, that each pixel of the rows (n) measures."""
     tile = np.array(["RGB".index(colour) for colour in mosaic]).reshape(2, 2)
     return tile[np.asarray(rows)[:, None] % 2, np.arange(width) % 2]
 
 
 def check_brightness(sensor: Sensor, frames: int) -> None:
-    """Raises ValueError unless it says the brightness of each of so many frames, or of none."""
+    """Raise ValueError if ``brightness`` is set but does not have one value for each frame."""
     if sensor.scripted and len(sensor.brightness) != frames:
         count = len(sensor.brightness)
         raise ValueError(f"sensor brightness has {count} values: one for each of {frames} frames is needed")
 
 
 def fall_off(sensor: Sensor, width: int, height: int, rows: ArrayLike) -> NDArray[np.float64]:
-    """Light on rows (n) of an image over that of its clean twin: (n, width); of one camera and time."""
+    """Return the light on rows (n) of an image relative to an ideal sensor's: vignetting times brightness.
+
+    The result has shape (n, width); ``sensor`` is that of one camera and frame, from ``Sensor.of``.
+    """
     x, y = np.arange(width) - (width - 1) / 2, np.asarray(rows) - (height - 1) / 2
     corner = ((width - 1) / 2) ** 2 + ((height - 1) / 2) ** 2
     share = 1.0 - sensor.vignetting * (x**2 + y[:, None] ** 2) / max(corner, 1.0)
@@ -194,19 +197,20 @@ def fall_off(sensor: Sensor, width: int, height: int, rows: ArrayLike) -> NDArra
 def expose(
     linear: NDArray[np.float32], sensor: Sensor, seed: int, height: int, rows: ArrayLike
 ) -> NDArray[np.float64]:
-    """What the sensor says of rows of an image, linear, white = 1: from a little below 0 to 1.
+    """Simulate the sensor's readings of some rows of an image: linear, white = 1, from slightly below 0 to 1.
 
-    Each row has random numbers of its own, so that it has the same bits by itself and in the whole image.
+    The random numbers of a row depend only on the seed and the row, so that a row rendered alone has the same bits
+    as in the whole image.
 
     Returns:
-        (n, width, 3); (n, width, 1) where a mosaic lets one colour through to each pixel.
+        Values (n, width, 3), or (n, width, 1) for a sensor with a mosaic.
 
     Args:
-        linear: (n, width, 3) light over white, before the lens' fall-off.
-        sensor: of this camera and time.
-        seed: of the image, not negative.
-        height: rows of the whole image.
-        rows: (n) their numbers.
+        linear: (n, width, 3) light relative to white, before vignetting.
+        sensor: sensor of this camera and frame.
+        seed: seed of the image, not negative.
+        height: number of rows of the whole image.
+        rows: (n) numbers of the rows.
     """
     rows = np.asarray(rows)
     light = np.asarray(linear, dtype=np.float64) * fall_off(sensor, linear.shape[1], height, rows)[..., None]
@@ -222,9 +226,9 @@ def expose(
 
 
 def _read_out(light: NDArray[np.float64], sensor: Sensor, random: np.random.Generator) -> NDArray[np.float64]:
-    """One row over white, not rounded; dark current is taken off at its mean."""
+    """Simulate the reading of one row, relative to white and not rounded, minus the mean dark current."""
     dark = sensor.dark_current * sensor.exposure_s
-    # Far beyond white all is white, and Poisson numbers of the sun's electrons need not be drawn.
+    # Values far above white are clipped to white anyway, so the Poisson draw is bounded, e.g. for the sun.
     electrons = sensor.white * np.minimum(light, 10.0) + dark
     if sensor.photon_noise:
         electrons = random.poisson(electrons).astype(np.float64)
@@ -232,35 +236,37 @@ def _read_out(light: NDArray[np.float64], sensor: Sensor, random: np.random.Gene
 
 
 def to_srgb8(image: ArrayLike, exposure: float) -> NDArray[np.uint8]:
-    """8-bit sRGB (IEC 61966-2-1) of linear radiance (..., 3) times ``exposure``, clipped to [0, 1], rounded."""
+    """Convert linear radiance (..., 3) times ``exposure`` to 8-bit sRGB (IEC 61966-2-1), clipped and rounded."""
     linear = np.asarray(image, dtype=np.float32) * np.float32(exposure)
     return np.round(srgb_of(linear) * 255.0).astype(np.uint8)
 
 
 def linear_of_codes(codes: ArrayLike) -> NDArray[np.float64]:
-    """Linear values of 8-bit sRGB codes (...), also between them: the inverse of ``to_srgb8`` at exposure 1."""
+    """Convert 8-bit sRGB codes (...), also fractional ones, to linear: inverts ``to_srgb8`` at exposure 1."""
     return srgb_to_linear(np.clip(np.asarray(codes, dtype=np.float64) / 255.0, 0.0, 1.0))
 
 
 def srgb_of(linear: NDArray[Any]) -> NDArray[Any]:
-    """sRGB values (...), from 0 to 1, of linear ones, clipped; of their type."""
+    """Convert linear values (...), clipped to [0, 1], to sRGB values in [0, 1] of the same type."""
     return linear_to_srgb(np.clip(linear, 0.0, 1.0))
 
 
 _BLOCK = 16
-"""Rows of JPEG that are coded together; their colours are blended with those of the rows beside."""
+"""Number of rows that JPEG codes together; chroma upsampling also reads the adjacent rows."""
 _PAD = 2
 _LONGEST = 65500
-"""Pixels of a side of a JPEG image."""
+"""Largest width and height of a JPEG image, px."""
 
 
 def rows_needed(sensor: Sensor, rows: Sequence[int], height: int) -> Sequence[int]:
-    """Rows of the sensor, ascending, that decide these rows of its image; the same, where each decides itself.
+    """Return the sensor rows, ascending, on which these image rows depend after demosaicing and JPEG.
+
+    Without mosaic and JPEG, each image row depends only on itself, and ``rows`` itself is returned.
 
     Args:
-        sensor: of one camera and time.
-        rows: of the image.
-        height: of the whole image.
+        sensor: sensor of one camera and frame.
+        rows: rows of the image.
+        height: height of the whole image.
     """
     if sensor.mosaic == "none" and not sensor.jpeg_quality:
         return rows
@@ -271,14 +277,14 @@ def rows_needed(sensor: Sensor, rows: Sequence[int], height: int) -> Sequence[in
 def processed(
     read: NDArray[np.float64], sensor: Sensor, height: int, needed: Sequence[int], rows: Sequence[int]
 ) -> NDArray[np.uint8]:
-    """Rows (n, width, 3) of the image, sRGB, of what the sensor says of the rows that they need.
+    """Convert sensor readings to rows (n, width, 3) of the sRGB image: demosaicing, sRGB and JPEG.
 
     Args:
-        read: (m, width, 1 or 3) of ``electrons.expose``.
-        sensor: of one camera and time.
-        height: of the whole image.
-        needed: (m) numbers of the rows that were read, of ``rows_needed``.
-        rows: (n) of the image.
+        read: (m, width, 1 or 3) readings from ``expose``.
+        sensor: sensor of one camera and frame.
+        height: height of the whole image.
+        needed: (m) numbers of the rows that were read, from ``rows_needed``.
+        rows: (n) numbers of the image rows to return.
 
     Raises:
         RsbenchError: the image is too large for JPEG.
@@ -297,10 +303,10 @@ def processed(
 
 
 def compressed(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
-    """An image (H, W, 3), sRGB, after JPEG of a quality from 1 to 100.
+    """Return an sRGB image (H, W, 3) after JPEG compression and decompression; ``quality`` is 1 to 100.
 
     Raises:
-        RsbenchError: it is too large for JPEG.
+        RsbenchError: the image is too large for JPEG.
     """
     if max(image.shape) > _LONGEST:
         raise RsbenchError(f"sensor jpeg_quality = {quality}: a JPEG image has at most {_LONGEST} pixels a side")
@@ -312,9 +318,10 @@ def compressed(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
 
 
 def shares_of_noise(mosaic: Mosaic, width: int, height: int) -> NDArray[np.float64]:
-    """Variance (H, W, 3) of the image's linear values over that of the pixels read, inside the image.
+    """Return the ratio (H, W, 3) of the noise variance after demosaicing to that of raw pixels, inside the image.
 
-    Which pair of neighbours is chosen does not depend on its mean, so the choice does not change the variance.
+    Edge-aware demosaicing selects the pair of neighbours by their difference, which is independent of their mean,
+    so the selection does not change the variance.
     """
     if mosaic == "none":
         return np.ones((height, width, 3))
@@ -326,7 +333,7 @@ def shares_of_noise(mosaic: Mosaic, width: int, height: int) -> NDArray[np.float
 
 
 def _bands(sensor: Sensor, rows: Sequence[int], height: int) -> Iterator[range]:
-    """Rows of the image, ``rows`` among them, that can be made without those between the bands."""
+    """Yield ranges of image rows that together contain ``rows`` and can be processed independently."""
     size, beside = (_BLOCK, 1) if sensor.jpeg_quality else (1, 0)
     near = {row // size + by for row in rows for by in range(-beside, beside + 1)}
     blocks = np.array(sorted(near & set(range(-(-height // size)))))
@@ -336,17 +343,17 @@ def _bands(sensor: Sensor, rows: Sequence[int], height: int) -> Iterator[range]:
 
 
 def _read_for(sensor: Sensor, band: range, height: int) -> range:
-    """Rows of the sensor that decide a band of the image: interpolation looks one row farther."""
+    """Return the sensor rows on which a band of the image depends: demosaicing reads one more row on each side."""
     beside = 0 if sensor.mosaic == "none" else 1
     return range(max(band.start - beside, 0), min(band.stop + beside, height))
 
 
 def _interpolated(read: NDArray[np.float64], sensor: Sensor, first: int) -> NDArray[np.float64]:
-    """Three colours (n, W, 3) of rows (n, W) of a mosaic, of which the upper one has the number ``first``."""
+    """Demosaic rows (n, W) to colours (n, W, 3); ``first`` is the number of the topmost row."""
     black, top = sensor.levels
     shift = 16 - sensor.bits
     numbers = np.round(read * (top - black) + black).astype(np.uint16) << shift
-    # Beyond the border lies what is seen in a mirror on it, by pixels of the same colours.
+    # Mirroring at the border pixels continues the pattern of the colour filters.
     padded = np.pad(numbers, _PAD, mode="reflect")
     pattern = sensor.mosaic if first % 2 == 0 else sensor.mosaic[2:] + sensor.mosaic[:2]
     colours = cv2.demosaicing(padded, getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA"))[_PAD:-_PAD, _PAD:-_PAD]

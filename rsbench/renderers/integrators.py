@@ -1,12 +1,12 @@
-"""Integrators of radiance: ``sunsky``, free of noise, and Mitsuba's ``path`` on points of our own.
+"""Integrators of radiance: ``sunsky``, which is noise-free, and Mitsuba's ``path`` with our own sampler.
 
-Each moving object is a scene of its own, into whose frame every ray is carried at its own time. A lane knows where
-each object is at the time of its row, or of its instant of an exposure, as it knows the pose of its camera. So
-nothing is batched or interpolated, and without objects no instruction is added.
+Each moving object is a separate Mitsuba scene; every ray is transformed into the object's frame at the time of the
+ray. Each lane reads the poses of the objects, like that of the camera, at the time of its row or, within an
+exposure, of its instant. So no poses are interpolated, and scenes without objects run no additional instructions.
 
-Glossy surfaces lie below a clear coat. Light is mirrored by facets of the coat, or goes through it to the diffuse
-surface below and back. Both parts are those of one Mitsuba BSDF (``roughplastic``), which ``path`` uses too;
-``sunsky`` evaluates it without random numbers.
+Glossy surfaces have a clear coat. Microfacets of the coat reflect light, or the light passes through the coat to
+the diffuse surface below and back. Mitsuba's BSDF ``roughplastic`` models both parts; ``path`` uses it directly,
+and ``sunsky`` evaluates it without random numbers.
 """
 
 from __future__ import annotations
@@ -25,59 +25,63 @@ from rsbench.renderers.sensor import level
 
 
 class Hits(NamedTuple):
-    """What rays through the pixel centres of some rows meet; arrays (rows, width)."""
+    """First hits of the rays through the pixel centres of some rows; arrays (rows, width)."""
 
     depth: NDArray[np.float32]
-    """z in the camera of the row, metres; 0 = no surface."""
+    """z in the camera frame at the time of the row, metres; 0 = no surface."""
     labels: NDArray[np.uint8]
-    """Number of the object that moves and is seen there, 0 = none; see ``carried.SHADED``."""
+    """Number of the moving object seen there, 0 = none, plus ``SHADED`` in the shadow of one."""
     gloss: NDArray[np.bool_]
     """Whether the surface is glossy."""
 
     @classmethod
     def none(cls, rows: int, width: int) -> Hits:
-        """Nothing, to be filled."""
+        """Return arrays of zeros, to be filled."""
         shape = rows, width
         return cls(np.zeros(shape, np.float32), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_))
 
 
 _BELOW_A_COAT = 0.95
-"""Share of even light from all sides that passes the coat, divided by the share of upright light that does.
-0.946 to 0.953 for the roughnesses that a material may have, by the sum of that BSDF over directions."""
+"""Transmittance of the coat for uniform light from all directions, divided by that at normal incidence. It is
+0.946 to 0.953 for the allowed roughnesses, by numerical integration of the BSDF over directions."""
 
 
 def is_glossy(bsdf: Any, active: Any) -> Any:
-    """Whether BSDFs have a coat."""
+    """Return whether BSDFs have a glossy coat."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyReflection) & active
 
 
 class Coat:
-    """What glossy surfaces do where rays meet them."""
+    """Reflection of light by glossy surfaces at the points where rays hit them."""
 
     def __init__(self, hit: Any, normal: Any, ray: Any) -> None:
         """
         Args:
-            hit: Mitsuba's interaction, position and normals in the world.
-            normal: unit shading normals towards the eye.
-            ray: that met the surfaces.
+            hit: Mitsuba's surface interaction, with position and normals in the world frame.
+            normal: unit shading normals on the side of the ray's origin.
+            ray: rays that hit the surfaces.
         """
         self._bsdf, self._frame = hit.bsdf(), mi.Frame3f(normal)
         self._hit = mi.SurfaceInteraction3f(hit)
         self._hit.sh_frame, self._hit.wi = self._frame, self._frame.to_local(-ray.d)
 
     def share_towards(self, direction: Any, active: Any) -> Any:
-        """Radiance by an irradiance of 1 from unit directions, measured across them: of coat and surface below."""
+        """Return the radiance reflected, by coat and diffuse surface, per unit of light from unit directions.
+
+        The light is an irradiance on a plane perpendicular to the direction.
+        """
         return self._bsdf.eval(_context("all"), self._hit, self._frame.to_local(direction), active)
 
     def below(self, active: Any) -> Any:
-        """Radiance of the surface below by an even radiance of 1 from all sides: its albedo through the coat."""
+        """Return the radiance of the diffuse surface, seen through the coat, under uniform radiance 1."""
         upright = self._bsdf.eval(_context("diffuse"), self._hit, mi.Vector3f(0, 0, 1), active)
         return upright * (dr.pi * _BELOW_A_COAT)
 
     def mirrored(self, facet: Any, active: Any) -> tuple[Any, Any]:
-        """Rays by facets, drawn by points of the unit square, and the share of what they bring that is seen.
+        """Return rays reflected by microfacets, and the factors by which their radiance contributes.
 
-        The middle of the square is the mirror direction, or nearly; the mean over all of it is the coat's light.
+        ``facet`` are points of the unit square that select the microfacets: its centre gives nearly the mirror
+        direction, and the mean over the square is the light that the coat reflects.
         """
         found, share = self._bsdf.sample(_context("coat"), self._hit, mi.Float(0.5), facet, active)
         return self._hit.spawn_ray(self._frame.to_world(found.wo)), share
@@ -92,24 +96,26 @@ def _context(part: str) -> Any:
 
 
 SHADED = 128
-"""Added to the label of a pixel whose surface an object hides from the sun; the rest is the object's number, 0 of
-what stands still."""
+"""Value added to the label of a pixel whose surface is in the shadow of a moving object; the rest of the label is
+the number of the object seen there, 0 for the static scene."""
 
 
 @dataclass(frozen=True)
 class Placed:
-    """An object where it is at the times of the lanes."""
+    """A moving object with its poses at the times of the lanes."""
 
     scene: Any
     """Mitsuba's scene, in the frame of the object."""
     ball: tuple[Any, Any]
-    """Centre, in that frame, and square of the radius of a ball around it."""
+    """Centre, in that frame, and squared radius of a bounding sphere."""
     pose: list[Any]
-    """12 values: ``world_from_object``, R row-major, then t."""
+    """The 12 values of ``world_from_object``: R row-major, then t."""
 
     def carried(self, ray: Any, active: Any) -> tuple[Any, Any]:
-        """A ray of the world in the frame of the object, where its parameters mean the same; and whether it may
-        meet the object."""
+        """Transform a world ray into the object's frame, and test it against the bounding sphere.
+
+        A ray parameter denotes the same point in both frames.
+        """
         origin = mi.Point3f(*self._turned(ray.o - mi.Vector3f(*self.pose[9:])))
         direction = mi.Vector3f(*level(self._turned(ray.d)))
         centre, square = self.ball
@@ -118,18 +124,18 @@ class Placed:
         return mi.Ray3f(origin, direction), active & (dr.dot(off, off) <= square * dr.dot(direction, direction))
 
     def meets(self, ray: Any, active: Any) -> Any:
-        """Whether the object lies on rays of the world."""
+        """Return whether world rays hit the object."""
         own, near = self.carried(ray, active)
         return self.scene.ray_test(own, coherent=True, active=near)
 
     def _turned(self, v: Any) -> list[Any]:
-        """``R^T v``."""
+        """Return ``R^T v``."""
         R = self.pose
         return [R[k] * v.x + R[3 + k] * v.y + R[6 + k] * v.z for k in range(3)]
 
 
 def placed(scene: MitsubaScene, sensor: Any, pose: Any, active: Any = True) -> list[Placed]:
-    """The objects of a scene at the times of poses of the sensor, one number for each lane."""
+    """Return the moving objects of a scene at the times of the sensor's poses; ``pose`` is an index per lane."""
     return [
         Placed(each, ball, sensor.object_pose(number, pose, active))
         for number, (each, ball) in enumerate(zip(scene.objects, scene.balls, strict=True))
@@ -137,18 +143,18 @@ def placed(scene: MitsubaScene, sensor: Any, pose: Any, active: Any = True) -> l
 
 
 class First(NamedTuple):
-    """What rays meet first, in the frame of what they meet."""
+    """First hits of rays, each in the frame of the static scene or of the object that was hit."""
 
     found: Any
     """Mitsuba's preliminary intersection."""
     ray: Any
     pose: list[Any]
-    """12 values, as of ``Placed``."""
+    """The 12 values of the frame's pose, as in ``Placed``."""
     label: Any
-    """Number of the object, 0 of what stands still."""
+    """Number of the object, 0 for the static scene."""
 
     def surface(self, flags: Any, active: Any) -> Any:
-        """Mitsuba's interaction, position and normals in the world."""
+        """Return Mitsuba's surface interaction with position and normals in the world frame."""
         hit = self.found.compute_surface_interaction(self.ray, flags, active)
         at = self._out(hit.p)
         hit.p = mi.Point3f(*(value + place for value, place in zip(at, self.pose[9:], strict=True)))
@@ -156,13 +162,13 @@ class First(NamedTuple):
         return hit
 
     def _out(self, v: Any) -> list[Any]:
-        """``R v``."""
+        """Return ``R v``."""
         R = self.pose
         return [R[3 * k] * v.x + R[3 * k + 1] * v.y + R[3 * k + 2] * v.z for k in range(3)]
 
 
 def first(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> First:
-    """The nearest of what stands still and of the objects."""
+    """Return the nearest hit among the static scene and the moving objects."""
     here = [mi.Float(float(k in (0, 4, 8))) for k in range(12)]
     nearest = First(
         scene.scene.ray_intersect_preliminary(ray, coherent=True, active=active), ray, here, mi.UInt32(0)
@@ -181,14 +187,14 @@ def first(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed])
 
 
 def first_surface(scene: MitsubaScene, ray: Any, flags: Any, active: Any, objects: Sequence[Placed]) -> Any:
-    """Mitsuba's interaction with what the rays meet first; position and normals in the world."""
+    """Return Mitsuba's interaction at the first hit; position and normals are in the world frame."""
     if not objects:
         return scene.scene.ray_intersect(ray, ray_flags=flags, coherent=True, active=active)
     return first(scene, ray, active, objects).surface(flags, active)
 
 
 def hidden(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> Any:
-    """Whether anything lies on the rays."""
+    """Return whether the static scene or an object blocks the rays."""
     found = scene.scene.ray_test(ray, coherent=True, active=active)
     for each in objects:
         found = found | each.meets(ray, active & _not(found))
@@ -196,9 +202,9 @@ def hidden(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]
 
 
 def depth_and_label(scene: MitsubaScene, ray: Any, active: Any, objects: Sequence[Placed]) -> tuple[Any, Any, Any]:
-    """Ray parameter (0: none), label (see ``SHADED``) and BSDF of the first surface along rays.
+    """Return the ray parameter (0: no hit), label (see ``SHADED``) and BSDF of the first surface along rays.
 
-    A single ray that meets nothing has no BSDF: None.
+    The BSDF is None for a single (scalar) ray that hits nothing.
     """
     nearest = first(scene, ray, active, objects)
     hit = nearest.surface(mi.RayFlags.Minimal, active)
@@ -229,15 +235,15 @@ def sunsky_radiance(
     objects: Sequence[Placed] = (),
     facet: Any = None,
 ) -> Any:
-    """Radiance (RGB) along unit rays: a sun with hard shadows and a hemisphere sky on diffuse surfaces.
+    """Return the radiance (RGB) along unit rays: a sun with hard shadows and a hemisphere sky on diffuse surfaces.
 
-    L = albedo (E_sun / pi max(n.s, 0) visible + S (0.6 + 0.4 n.up)), with S the cosine-weighted mean of the sky,
-    so that level ground in the open has its exact sky irradiance and a wall three fifths of it. It draws no random
-    number: the same ray has the same radiance, in every renderer, process and number of threads. With
-    ``sky_points`` on the unit sphere the sky's part is that of ``_seen_sky``: all direct light as ``path`` has it.
+    L = albedo (E_sun / pi max(n.s, 0) visible + S (0.6 + 0.4 n.up)), where S is the cosine-weighted mean of the
+    sky. So open horizontal ground gets its exact sky irradiance, and a vertical wall three fifths of it. No random
+    numbers are drawn: the radiance of a ray is the same in every renderer, process and number of threads. With
+    ``sky_points`` on the unit sphere, ``_seen_sky`` computes the sky's part: all direct light, as in ``path``.
 
-    The coat of a glossy surface mirrors the sun, and by ``facet``, a point of the unit square, what the mirrored
-    ray meets: its light without what glossy surfaces there would mirror in turn. Without ``facet``, the sun alone.
+    The coat of a glossy surface reflects the sun and, if ``facet`` (a point of the unit square) is given, the
+    scene along one reflected ray; glossy surfaces hit by that ray reflect only the sun.
     """
     sky = scene.sky
     flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
@@ -277,14 +283,14 @@ def sunsky_radiance(
 
 
 _WITHIN = 0.9999
-"""Share of the sphere's radius that is used: the opposite of a normal would leave no direction."""
+"""Scale of the points on the unit sphere: a point opposite to a normal would otherwise give a zero direction."""
 
 
 def _seen_sky(scene: MitsubaScene, hit: Any, normal: Any, sky_points: Sequence[Any], active: Any) -> Any:
-    """Radiance that a white open surface would have from the sky, times the share of its light that nothing hides.
+    """Return the radiance of an unoccluded white surface under the sky, times the unoccluded share of that light.
 
-    A unit normal plus a point on the unit sphere is a direction that the cosine law draws; of those directions the
-    sky's light is summed with and without what hides it. Their ratio is exact where nothing or all is hidden.
+    A unit normal plus a uniform point on the unit sphere gives a cosine-distributed direction. The sky's light is
+    summed over these directions with and without occlusion; the ratio is exact if none or all are occluded.
     """
     seen, whole = mi.Color3f(0.0), mi.Color3f(0.0)
     for point in sky_points:
@@ -298,19 +304,19 @@ def _seen_sky(scene: MitsubaScene, hit: Any, normal: Any, sky_points: Sequence[A
 
 @cache
 def path_integrator(max_depth: int) -> Any:
-    """Mitsuba's path tracer, paths of at most ``max_depth`` segments."""
+    """Return Mitsuba's path tracer for paths of at most ``max_depth`` segments."""
     return mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
 
 
 def lane_sampler() -> Any:
-    """A Mitsuba sampler whose numbers depend on seed, pixel and sample alone, not on the place in the wavefront.
+    """Return a Mitsuba sampler whose numbers depend only on seed, pixel and sample, not on the lane number.
 
-    The samples of a pixel are spread evenly in each dimension of a path, and in pairs of them: Sobol' points, of
-    which every pixel and dimension has its own scrambling (S. Laine, T. Karras, Stratified sampling for stochastic
+    The samples of a pixel are Sobol' points, stratified in each dimension or pair of dimensions of a path, with a
+    different scrambling for each pixel and dimension (S. Laine, T. Karras, Stratified sampling for stochastic
     transparency, EGSR 2011; B. Burley, Practical hash-based Owen scrambling, JCGT 2020). Mitsuba's own samplers
-    number the lanes of a launch, so a row rendered by itself would draw other numbers than the same row of a whole
-    image. A new one each time: what it would draw next depends on the path so far, and so keeps the whole scene
-    alive.
+    number the lanes of a launch, so a row rendered alone would draw other numbers than the same row of a whole
+    image. The sampler is created anew each time, because its state refers to the traced path and would keep the
+    whole scene in memory.
     """
     _register_lane_sampler()
     return mi.load_dict({"type": "rsbench_lanes"})
@@ -324,7 +330,7 @@ def _register_lane_sampler() -> None:
             self.pixel, self.place, self.dimension = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
 
         def seed_lanes(self, seed: Any, pixel: Any, sample: Any) -> None:
-            """Start the sequences of (pixel, sample) pairs; ``pixel`` is the index in the full frame."""
+            """Start the sequences for (pixel, sample) pairs; ``pixel`` is the index in the full frame."""
             self.pixel, _ = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(pixel))
             self.place, self.dimension = reversed_bits(mi.UInt32(sample)), mi.UInt32(0)
 
@@ -335,7 +341,7 @@ def _register_lane_sampler() -> None:
             return mi.Point2f(*self._next(True))
 
         def _next(self, both: bool) -> list[Any]:
-            """Coordinates of the next dimension, or of the next two."""
+            """Return the coordinates of the next dimension, or of the next pair of dimensions."""
             order, first = mi.sample_tea_32(self.pixel, self.dimension)
             self.dimension += 1
             shuffled = scrambled(self.place, order)
@@ -352,14 +358,14 @@ _WORD = 0xFFFFFFFF
 
 
 def reversed_bits(x: Any) -> Any:
-    """Of 32; as all below, of whole numbers and of Dr.Jit's arrays of them."""
+    """Reverse the 32 bits; like the functions below, it accepts integers and Dr.Jit arrays of integers."""
     for step, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF)):
         x = ((x >> step) & mask) | ((x & mask) << step)
     return ((x >> 16) | (x << 16)) & _WORD
 
 
 def scrambled(x: Any, key: Any) -> Any:
-    """A permutation in which a bit changes none below it: of reversed bits, Owen's."""
+    """Permute 32-bit values so that a bit never affects lower bits: Owen scrambling of the reversed bits."""
     x = (x + key) & _WORD
     for factor in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
         x = x ^ ((x * factor) & _WORD)
@@ -367,12 +373,12 @@ def scrambled(x: Any, key: Any) -> Any:
 
 
 def sobol(x: Any) -> Any:
-    """The second coordinate, as 32 bits, of the Sobol' point whose first coordinate has these."""
+    """Return the second coordinate of a 2D Sobol' point from its first one; both are 32-bit fractions."""
     for step, mask in ((16, 0x0000FFFF), (8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
         x = x ^ ((x & mask) << step)
     return x & _WORD
 
 
 def unit(x: Any) -> Any:
-    """32 bits as a number from 0 to below 1, which 24 of them fill."""
+    """Convert 32 bits to a single-precision number in [0, 1), using the 24 upper bits."""
     return mi.Float(x >> 8) * (1.0 / (1 << 24))

@@ -1,12 +1,12 @@
-"""Finding a libLLVM that Dr.Jit can use, without ever risking the user's process.
+"""Finds a libLLVM that Dr.Jit can use, without crashing the user's process.
 
-Dr.Jit loads libLLVM at run time. Its own search takes the first one it finds, and LLVM 15 and 16 (still the
+Dr.Jit loads libLLVM at run time. Its own search takes the first library it finds, and LLVM 15 and 16 (still the
 default of common systems) abort the whole process at the first kernel. So every candidate is first loaded by a
-child process that compiles a small kernel; only a library that survives that reaches the user's process.
+child process that compiles a small kernel; only a library that passes this probe is loaded here.
 
-What the probes of earlier processes found is kept in the user's cache folder so that start-up costs nothing. Only
-successes are kept: the next start may cure a failure, and probing again costs a fraction of a second. No error of
-the cache is raised: without a home folder or with a read-only one nothing is remembered.
+Successful probes are stored in the user's cache folder, so that later starts need none. Failures are not stored:
+the cause may be gone at the next start, and a probe takes a fraction of a second. Errors of the cache are ignored:
+without a home folder or with a read-only one, nothing is stored.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ _MAXIMUM_ENTRIES = 64
 
 
 def cache_file() -> Path | None:
-    """File with the results of earlier probes; None when the user has no home folder."""
+    """Return the file with the results of earlier probes, or None if the user has no home folder."""
     base = user_cache()
     return base / "probes.json" if base is not None and base.is_absolute() else None
 
 
 def recall(key: str) -> str | None:
-    """The version that a successful probe reported, or None."""
+    """Return the version that an earlier successful probe reported, or None."""
     return _read().get(key)
 
 
 def remember(key: str, version: str) -> None:
-    """Store a successful probe; silently does nothing where nothing can be written."""
+    """Store a successful probe; do nothing if the cache cannot be written."""
     file = cache_file()
     if file is None:
         return
@@ -132,7 +132,7 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class ProbeResult:
-    """What became of a probe; ``version`` is empty unless the library is usable."""
+    """Result of a probe; ``version`` is empty unless the library is usable."""
 
     ok: bool
     version: str = ""
@@ -140,7 +140,7 @@ class ProbeResult:
 
 
 def candidates(environ: Mapping[str, str] | None = None) -> Iterator[Candidate]:
-    """Yield the libraries to try, best first; a path that the user set is the only one tried."""
+    """Yield the libraries to try, best first; only the user's path if it is set."""
     environ = os.environ if environ is None else environ
     chosen = environ.get("DRJIT_LIBLLVM_PATH", "")
     if chosen:
@@ -176,12 +176,12 @@ def _system_libraries() -> list[tuple[Path, str]]:
 
 
 def outdated_libraries() -> list[Path]:
-    """System libraries that are never tried because their name spells an unsuitable version."""
+    """Return system libraries that are never tried because their name contains an unsuitable version."""
     return sorted(path for path, version in _installed().items() if 0 < version < MINIMUM_VERSION)
 
 
 def _installed() -> dict[Path, int]:
-    """System libraries and the versions that their names spell."""
+    """Return system libraries with the versions in their names."""
     found: dict[Path, int] = {}
     for pattern in (*_SYSTEM_GLOBS, f"{sys.prefix}/lib/libLLVM*.so*"):
         for name in glob.glob(pattern):
@@ -192,16 +192,16 @@ def _installed() -> dict[Path, int]:
 
 
 def version_in_path(text: str) -> int:
-    """The LLVM major version that a file name or path spells, 0 when it spells none."""
+    """Return the LLVM major version in a file name or path, or 0 if there is none."""
     versions = [int(part) for match in _VERSION_IN_PATH.findall(text) for part in match if part]
     return max(versions, default=0)
 
 
 def _missing_links(library: Path) -> tuple[Path, ...]:
-    """The C++ runtime to load by hand when the wheel's symbolic links to it were never made.
+    """Return the C++ runtime libraries to preload if the wheel's symbolic links to them are missing.
 
-    karellen-llvm-core makes its links at the first start of the Python it was installed with, so they are
-    missing after an installation by another tool or user. A loaded library of the same soname stands in.
+    karellen-llvm-core creates its links at the first start of the Python it was installed with, so they are
+    missing after an installation by another tool or user. A loaded library of the same soname replaces them.
     """
     for folder in library.parent.glob("*-linux-gnu*"):
         if (folder / "libc++.so.1.0").is_file() and not (folder / "libc++.so.1").exists():
@@ -211,7 +211,7 @@ def _missing_links(library: Path) -> tuple[Path, ...]:
 
 
 def probe(candidate: Candidate, timeout: float = 60.0) -> ProbeResult:
-    """Whether Dr.Jit works with the library, found out in a child process; good news is remembered on disk."""
+    """Test in a child process whether Dr.Jit works with the library; successes are stored on disk."""
 
     def compile_kernel() -> ProbeResult:
         with tempfile.TemporaryDirectory(prefix="rsbench-probe-") as scratch:
@@ -226,7 +226,7 @@ def probe(candidate: Candidate, timeout: float = 60.0) -> ProbeResult:
 
 
 def remembered(kind: str, library: Path, machine: str, probe: Callable[[], ProbeResult]) -> ProbeResult:
-    """The result of a probe, which is not repeated after a success with the same library on the same machine."""
+    """Return the result of a probe; it is not repeated after a success with this library on this machine."""
     try:
         status = library.stat()
     except OSError as error:
@@ -242,10 +242,10 @@ def remembered(kind: str, library: Path, machine: str, probe: Callable[[], Probe
 
 
 def run_child(code: str, arguments: Sequence[str], environ: Mapping[str, str], timeout: float) -> ProbeResult:
-    """Run Python code in a child process; it passes by printing ``version ...`` as its last line, exit code 0.
+    """Run Python code in a child process; success is exit code 0 and ``version ...`` as its last line.
 
-    ``-P`` keeps the working directory out of the child's path; it finds modules where this process does. On Linux
-    the child ends with this process, however that ends.
+    ``-P`` excludes the working directory from the child's path, which is otherwise that of this process. On Linux
+    the child ends with this process, even if this process is killed.
     """
     path = os.pathsep.join(folder for folder in sys.path if folder)
     try:
@@ -283,7 +283,7 @@ def load(candidate: Candidate) -> None:
 
 
 def cpu_features() -> str:
-    """The instruction sets that decide Dr.Jit's vector width, for people: ``x86_64 avx512f avx2``."""
+    """Describe the instruction sets that determine Dr.Jit's vector width, such as ``x86_64 avx512f avx2``."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:

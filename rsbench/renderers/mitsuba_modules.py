@@ -1,4 +1,4 @@
-"""Dr.Jit and Mitsuba, imported at their first use: that takes a second, and the backend must be chosen before."""
+"""Imports Dr.Jit and Mitsuba at their first use: this takes a second and must follow the choice of a backend."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 class _ImportedAtFirstUse:
-    """Stands for a module until its first use, which puts the module in its place in all modules of rsbench.
+    """Placeholder of a module; its first use replaces it by the module in all modules of rsbench.
 
     A lookup through this class takes 20 times as long as one in the module, and scalar tracing makes dozens of
     lookups per ray.

@@ -15,7 +15,7 @@ _MOST_SAMPLES, _LONGEST_PATH, _MOST_SKY_RAYS = 1 << 16, 1 << 10, 64
 
 @dataclass(frozen=True, kw_only=True)
 class RendererOptions:
-    """Options of rendering images; depth does not depend on them.
+    """Options for rendering images; depth does not depend on them.
 
     Raises:
         RsbenchError: a value is out of its range.
@@ -36,10 +36,9 @@ class RendererOptions:
     seed: int = 0
     """Seed of the random numbers that ``path`` draws."""
     sky_rays: int = 0
-    """Rays that ``sunsky`` sends from each seen point to find whether surfaces hide the sky there; 0: nothing
-    hides it."""
+    """Number of rays by which ``sunsky`` tests the occlusion of the sky at each surface point; 0: no occlusion."""
     full_frames: bool = False
-    """``stitched`` renders every row of every global-shutter image, and not only the kept one."""
+    """Whether ``stitched`` renders every row of every global-shutter image, and not only the kept one."""
 
     def __post_init__(self) -> None:
         _one_of("method", self.method, get_args(Method))
@@ -59,7 +58,7 @@ class RendererOptions:
 
     @property
     def record(self) -> dict[str, Any]:
-        """Values for JSON; keys that were added later are left out at their defaults."""
+        """Return the values for JSON, without keys added in later versions that have their defaults."""
         return {name: value for name, value in asdict(self).items() if name != "sky_rays" or value}
 
 

@@ -1,9 +1,9 @@
 """Rendering rolling-shutter images and their exact depth from row poses.
 
-Two methods make the same frame. ``stitched`` is how the paper made its data: a whole global-shutter image at the
-pose of every row, of which one row is kept. ``single-pass`` gives every ray the pose of its row in one kernel, at
-the price of one global-shutter image. They agree bit for bit, in image and depth. ``sensed_rows`` makes the frame
-as a camera delivers it: exposed, with noise, interpolated and compressed.
+Two methods render the same frame. ``stitched`` is the method of the paper: it renders a whole global-shutter image
+at the pose of every row and keeps one row. ``single-pass`` gives every ray the pose of its row in one kernel, at
+the cost of one global-shutter image. Their images and depths agree bit for bit. ``sensed_rows`` renders the frame
+as a camera delivers it: with exposure, noise, demosaicing and compression.
 """
 
 from __future__ import annotations
@@ -37,29 +37,29 @@ OnGlobalFrame = Callable[[int, Float32Array], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """An image and its depth; the requested rows, in that order (all ``height`` of them by default)."""
+    """The requested rows of an image and its depth, in that order (by default, all ``height`` rows)."""
 
     image: Float32Array
     """(rows, width, 3) linear RGB radiance."""
     depth: Float32Array
-    """(rows, width) z in the camera of the row, metres, at pixel centres; 0 = no surface."""
+    """(rows, width) z in the camera frame of the row, metres, at pixel centres; 0 = no surface."""
     labels: NDArray[np.uint8]
-    """(rows, width) number of the object that moves and is seen there, 0 = none; see ``carried.SHADED``."""
+    """(rows, width) number of the moving object at pixel centres, 0 = none; see ``integrators.SHADED``."""
     gloss: NDArray[np.bool_]
-    """(rows, width) whether the surface is glossy that the ray through the pixel's centre meets."""
+    """(rows, width) whether the surface at the pixel centre is glossy."""
 
 
 class LinePoses(NamedTuple):
-    """Poses of the camera, and of objects that move, while each line of a frame is read or exposed."""
+    """Poses of the camera and of moving objects at the times when each line of a frame is read or exposed."""
 
     R: ArrayLike
     """([instants,] lines, 3, 3) ``cam_from_world``."""
     t: ArrayLike
-    """([instants,] lines, 3) metres, ``X_cam = R @ X_world + t``; equal lines make a global shutter."""
+    """([instants,] lines, 3) metres, ``X_cam = R @ X_world + t``; equal poses in all lines: a global shutter."""
     objects: Pose | None = None
-    """(objects, [instants,] lines, ...) ``world_from_object`` of the scene's objects that move."""
+    """(objects, [instants,] lines, ...) ``world_from_object`` of the scene's moving objects."""
     columns: bool = False
-    """Whether lines are columns."""
+    """Whether lines are columns instead of rows."""
 
 
 def render(
@@ -72,21 +72,22 @@ def render(
     rows: Sequence[int] | None = None,
     on_gs_frame: OnGlobalFrame | None = None,
 ) -> Frame:
-    """Render a frame whose every line has its own poses, by ``options.method``.
+    """Render a frame in which every line has its own poses, by ``options.method``.
 
     Args:
-        scene: in the world frame of the poses.
+        scene: scene in the world frame of the poses.
         camera: size and intrinsics; the centre of the top-left pixel is (0, 0).
-        poses: of each line at its time.
-        options: a renderer card; the default one when absent.
-        exposed: of each line at instants while it collects light, see ``exposure``; the image is their mean, the
-            depth that of ``poses``. The number of instants is a multiple of ``options.samples``.
-        rows: render only these rows of the full frame, with the bits that they have in it.
-        on_gs_frame: ``stitched`` with ``full_frames`` calls it with each row and its global-shutter image
-            (height, width, 3), so that the stack can be kept as the paper keeps it.
+        poses: poses of each line at its time.
+        options: options of the renderer, by default those of the default card.
+        exposed: poses of each line at the instants of its exposure, see ``pixel_samples``; the image is the mean
+            over the instants, the depth is that of ``poses``. ``options.samples`` must divide their number.
+        rows: render only these rows of the full frame; their bits are the same as in the full frame.
+        on_gs_frame: called by ``stitched`` with ``full_frames`` with each row and its global-shutter image
+            (height, width, 3), so that the stack of images can be kept as in the paper.
 
     Raises:
-        RsbenchError: shapes or values of the poses, rows outside the image, ``on_gs_frame`` without whole frames.
+        RsbenchError: poses have wrong shapes or values, rows lie outside the image, or ``on_gs_frame`` is given
+            without whole frames.
     """
     options = RendererOptions() if options is None else options
     if on_gs_frame is not None and not (options.method == "stitched" and options.full_frames):
@@ -128,7 +129,7 @@ def _single_pass(
     options: RendererOptions,
     rows: Sequence[int],
 ) -> Frame:
-    """``poses`` are those of the image and those of the depth, as of ``_stitched``."""
+    """Render by ``single-pass``; ``poses`` are those of the image and those of the depth."""
     tracer = _tracer()
     image_sensor, row_sensor = (_sensor(camera, each) for each in poses)
     image = tracer.radiance_rows(scene, image_sensor, camera, rows, options)
@@ -143,10 +144,10 @@ def _stitched(
     rows: Sequence[int],
     on_gs_frame: OnGlobalFrame | None,
 ) -> Frame:
-    """Render one global-shutter camera per row. Without ``full_frames`` only the kept row of each is traced.
+    """Render one global-shutter image per row. Without ``full_frames`` only the kept row of each is traced.
 
-    The pixels of that row keep their index in the full frame, and so their random numbers, and their neighbours in
-    a packet, and so their rounding: they have the bits of the whole image. For columns, all rows are traced.
+    The pixels of that row keep their index in the full frame and their neighbours in a packet, and so their random
+    numbers and rounding: they have the bits of the whole image. For columns, all rows are traced.
     """
     tracer, columns = _tracer(), poses[0].columns
     sensors = [_sensor(camera, each) for each in poses]
@@ -210,17 +211,17 @@ def sensed_rows(
     rows: Sequence[int] | None = None,
     twin: int | None = None,
 ) -> NDArray[np.uint8]:
-    """Rows (rows, width, 3) of a frame, all by default; 8-bit sRGB.
+    """Render rows (rows, width, 3) of a frame, by default all, as 8-bit sRGB of a simulated sensor.
 
     Args:
-        scene: in the world frame of the motion.
-        geometry: the middle of a row's exposure is its time.
+        scene: scene in the world frame of the motion.
+        geometry: rig, shutter and motion; the time of a row is the middle of its exposure.
         view: side of the rig and number of the frame.
-        sensor: of this camera and frame.
-        frame_period_s: seconds of a frame period, in which the motion counts.
-        options: how to render; their seed is that of the image, of the noise too.
-        rows: these only, with the bits that they have in the whole frame.
-        twin: all rows are exposed about the time of this row, counted as rows are read, as by a global shutter.
+        sensor: sensor of this camera and frame.
+        frame_period_s: frame period, seconds; the motion's unit of time.
+        options: options of the renderer; their seed is also that of the sensor noise.
+        rows: render only these rows; their bits are the same as in the whole frame.
+        twin: a row, in readout order, at whose time all rows are exposed, as by a global shutter.
     """
     rig, shutter, (side, frame) = geometry.rig, geometry.shutter, view
     tau = shutter.line_times(frame, side)

@@ -1,4 +1,4 @@
-"""Tracing ray by ray with ``scalar_rgb``, where no LLVM works: slow, and free of any compiler.
+"""Tracing ray by ray with ``scalar_rgb``, for machines without a working LLVM: slow, but needs no compiler.
 
 The same formulas as the wavefront, sample for sample; only rounding differs.
 """
@@ -30,7 +30,7 @@ Float32Array = NDArray[np.float32]
 
 
 def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Hits:
-    """What the rays through pixel centres meet."""
+    """Return the first hits of the rays through the pixel centres."""
     depth, labels, gloss = result = Hits.none(len(rows), camera.width)
     for place, row in enumerate(rows):
         for column in range(camera.width):
@@ -50,7 +50,7 @@ def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Se
 def radiance_rows(
     scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
 ) -> Float32Array:
-    """Linear RGB (rows, width, 3): the mean over the sub-pixel grid (a box filter)."""
+    """Return linear RGB (rows, width, 3): the mean over the sub-pixel grid (a box filter)."""
     grid = subpixel_grid(options.samples).tolist()
     sky = sky_points(options.samples, options.sky_rays).tolist() if options.sky_rays else [[]] * options.samples
     facets = facet_points(options.samples).tolist()

@@ -1,8 +1,8 @@
 """A scene in Mitsuba: built once, rendered from any number of poses.
 
-For ``sunsky`` the textures of all materials are bytes of one array, with one look-up. Mitsuba stores a texture as
-four floats per pixel, four times as much, and compiles code for each material. The arithmetic is that of Dr.Jit's
-bilinear, repeated textures, bit for bit.
+For ``sunsky``, the textures of all materials are bytes in one array, read by one look-up. Mitsuba itself stores
+four floats per pixel, four times as much, and compiles code for each material. The arithmetic matches Dr.Jit's
+bilinear, repeated textures bit for bit.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from rsbench.scenes.model import Environment, Light, Material, Scene, SceneMesh,
 
 
 class Reflectances:
-    """Diffuse reflectance of the surfaces of a scene, as data: another scene compiles nothing."""
+    """Diffuse reflectance of the surfaces of a scene as kernel inputs: another scene needs no compilation."""
 
     def __init__(self, surfaces: Sequence[tuple[Any, Material]]) -> None:
-        """``surfaces``: Mitsuba's shapes, and their materials.
+        """Store the reflectance of ``surfaces``, which are Mitsuba's shapes and their materials.
 
         Raises:
             RsbenchError: a texture is invalid.
@@ -56,7 +56,7 @@ class Reflectances:
         dr.eval(self._places, self._colours, self._texels, self._codes)
 
     def texture(self, shape: Any) -> NDArray[np.uint8] | None:
-        """Texture (h, w, 3) of a shape's material; None without one."""
+        """Return the texture (h, w, 3) of a shape's material, or None."""
         begin, width, height = (int(each[_number(shape)]) for each in self._places)
         if width == 0:
             return None
@@ -65,7 +65,7 @@ class Reflectances:
         return np.stack(channels, axis=-1).astype(np.uint8).reshape(height, width, 3)
 
     def at(self, hit: Any, active: Any) -> Any:
-        """Reflectance (RGB) of the surfaces of Mitsuba's interactions."""
+        """Return the reflectance (RGB) of the surfaces at Mitsuba's interactions."""
         number = dr.reinterpret_array(mi.UInt32, hit.shape)
         begin, width, height = (dr.gather(mi.UInt32, each, number, active) for each in self._places)
         textured = active & (width > 0)
@@ -82,17 +82,17 @@ class Reflectances:
 
 
 def _number(shape: Any) -> int:
-    """Identifier of a shape inside a kernel."""
+    """Return the identifier of a shape inside a kernel."""
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 def _between(coordinate: Any, size: Any) -> list[tuple[Any, Any]]:
-    """The two texels of an axis around coordinates, with their weights; the last one's neighbour is the first."""
+    """Return the two nearest texels along an axis and their weights; the texture repeats."""
     place = dr.fma(coordinate, mi.Float(size), -0.5)
     whole, count = dr.floor(place), mi.Int32(dr.maximum(size, 1))
     share, at = place - whole, mi.Int32(whole)
-    # Division of integers is slow. A quotient of floats may be off, the second one by one; what is larger than a
-    # whole number can be ends at some texel.
+    # Integer division is slow. The quotient of floats may be inexact, after the second pass by at most 1;
+    # coordinates beyond the range of integers give an arbitrary valid texel.
     for _ in range(2):
         at -= mi.Int32(dr.floor(mi.Float(at) / mi.Float(count))) * count
     at = dr.select(at < 0, at + count, at)
@@ -101,7 +101,7 @@ def _between(coordinate: Any, size: Any) -> list[tuple[Any, Any]]:
 
 
 def checked_texture(material: Material) -> NDArray[np.uint8]:
-    """The texture of a textured material; RsbenchError if it is not (h, w, 3) uint8."""
+    """Return the texture of a textured material; raise RsbenchError if it is not (h, w, 3) uint8."""
     texture = np.asarray(material.texture)
     if texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:
         raise RsbenchError(
@@ -113,9 +113,9 @@ def checked_texture(material: Material) -> NDArray[np.uint8]:
 
 @cache
 def linear_codes() -> NDArray[np.float32]:
-    """Linear intensity (256,) of each 8-bit sRGB code, with the rounding of Mitsuba's own conversion.
+    """Return the linear intensity (256,) of each 8-bit sRGB code, with the rounding of Mitsuba's own conversion.
 
-    Looking them up is several times faster than letting Mitsuba convert whole textures, and bit for bit the same.
+    Looking up codes is several times faster than Mitsuba's conversion of whole textures, with identical bits.
     """
     codes = mi.Bitmap(np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(3, axis=2))
     linear = codes.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
@@ -131,12 +131,12 @@ _SKY_ROWS = 64  # of the sky map that `path` samples; the sky is linear in the s
 class MitsubaScene:
     """Meshes, materials, sun and sky of a ``Scene`` in the world frame.
 
-    Starts the renderer backend when the program has not done so.
+    The constructor starts the renderer backend if the program has not done so.
 
     Raises:
-        RsbenchError: a mesh or texture has the wrong shape, is not finite or points at vertices that it does not
-            have; a textured mesh has no uv; the sun or the zenith has no direction; objects move on a GPU; there
-            is no backend.
+        RsbenchError: a mesh or texture has the wrong shape, is not finite or refers to missing vertices; a
+            textured mesh has no uv; the direction of the sun or the zenith is zero; there are moving objects on a
+            GPU; or there is no backend.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -145,19 +145,19 @@ class MitsubaScene:
         self.light = scene.light
         drawn = [mesh for mesh in scene.meshes if mesh.faces.size]
         if variant == VARIANTS["cuda"] and any(mesh.mover for mesh in drawn):
-            # Each is a scene of its own; on a GPU a kernel silently traces rays in only one of them.
+            # Each object is a separate scene; on a GPU, a kernel silently traces rays in only one of them.
             raise RsbenchError(
                 f"scene {scene.name}: objects that move are not rendered on a GPU: choose backend llvm"
             )
         content: dict[str, Any] = {"type": "scene", **_lights(scene.light)}
         moved: list[dict[str, Any]] = [{"type": "scene"} for _ in range(max((m.mover for m in drawn), default=0))]
         self.glossy = scene.glossy
-        """Whether any surface is."""
+        """Whether any surface is glossy."""
         bare = dr.is_jit_v(mi.Float)
         materials: dict[int, tuple[Material, Any]] = {}
         surfaces, self._bare = list[tuple[Any, Material]](), list[tuple[Any, Material]]()
         self.instances = [{"name": mesh.name, "material": mesh.material.name} for mesh in drawn]
-        """Names of the meshes with faces; the shapes of the renderer are called mesh00000 and so on."""
+        """Names of the meshes that have faces; the shapes of the renderer are called mesh00000 and so on."""
         for number, mesh in enumerate(drawn):
             key = id(mesh.material)
             if key not in materials:
@@ -174,19 +174,19 @@ class MitsubaScene:
         # Merging shapes of equal material, the default, depends on the order of a parallel loader.
         self.scene = mi.load_dict(content, optimize=False)
         self.objects = [mi.load_dict(each, optimize=False) for each in moved]
-        """Scenes of the objects that move, each in the world as it is at time 0."""
+        """One scene for each moving object, in the world frame with the object's pose at time 0."""
         self.balls = [_ball([m.vertices for m in drawn if m.mover == k + 1]) for k in range(len(moved))]
         self.sky = Sky(scene.light, self.scene.environment())
         gc.collect()  # `mi.traverse` leaves cyclic garbage that references its shape, and so the textures
 
     def reflectance(self, hit: Any, active: Any) -> Any:
-        """Diffuse reflectance (RGB) where Mitsuba's interactions are."""
+        """Return the diffuse reflectance (RGB) at Mitsuba's interactions."""
         if self._reflectances is None:
             return hit.bsdf().eval_diffuse_reflectance(hit, active)
         return self._reflectances.at(hit, active)
 
     def textured(self) -> Any:
-        """Mitsuba's scene with the textures of its materials, which are loaded at the first call: for ``path``."""
+        """Return Mitsuba's scene with textured materials, for ``path``; the first call loads the textures."""
         if self._reflectances is not None:
             materials: dict[int, Any] = {}
             for shape, material in self._bare:
@@ -198,23 +198,23 @@ class MitsubaScene:
         return self.scene
 
     def __del__(self) -> None:
-        # Dr.Jit keeps hundreds of MB of freed memory for arrays of the same size, which another scene hardly has.
+        # Dr.Jit keeps hundreds of MB of freed memory for arrays of the same sizes, which another scene rarely has.
         if self.__dict__ and not sys.is_finalizing():
             self.__dict__.clear()
             give_back_memory()
 
 
 def give_back_memory() -> None:
-    """Return the memory of freed arrays, which Dr.Jit keeps, to the system."""
+    """Return the memory of freed arrays, which Dr.Jit caches, to the system."""
     dr.sync_thread()
     dr.flush_malloc_cache()
 
 
 class Sky:
-    """Sun and sky in the form that the kernels read: data, so another sun compiles nothing."""
+    """Sun and sky as kernel inputs, so that another sun needs no compilation."""
 
     def __init__(self, light: Light, emitter: Any) -> None:
-        """``emitter``: Mitsuba's emitter of the sky, used where the light has an environment map."""
+        """Store the light; ``emitter`` is Mitsuba's emitter of the sky, used for an environment map."""
 
         def opaque(values: Any) -> Any:
             return [dr.opaque(mi.Float, float(value)) for value in values]
@@ -231,13 +231,13 @@ class Sky:
             self._around, self._open = emitter, mi.load_dict(_mapped(open_, light.environment))
 
     def seen_along(self, direction: Any) -> Any:
-        """Radiance of the sky along unit directions: the horizon's colour below, towards the zenith's above."""
+        """Return the sky's radiance along unit directions: the horizon's colour below, blended to the zenith's."""
         if self.mapped:
             return _looked_up(self._around, direction)
         return self.horizon + (self.zenith - self.horizon) * dr.maximum(dr.dot(direction, self.up), 0)
 
     def on_open_surface(self, normal: Any) -> Any:
-        """Radiance of a white diffuse surface with unit normals under the whole sky and the ground below it.
+        """Return the radiance of a white diffuse surface with unit normals under the unoccluded sky and ground.
 
         The integral of max(n.w, 0) max(up.w, 0) over all directions w is 2 / 3 (sin a + (pi - a) cos a), with a
         between n and up: Cho and Saul, Kernel methods for deep learning, NIPS 2009, in three dimensions.
@@ -251,7 +251,7 @@ class Sky:
 
 
 def _looked_up(emitter: Any, direction: Any) -> Any:
-    """Radiance of an environment map along unit directions, as ``path`` has it."""
+    """Return the radiance of an environment map along unit directions, as ``path`` evaluates it."""
     ray = dr.zeros(mi.SurfaceInteraction3f)
     ray.wi = -direction
     return mi.Color3f(emitter.eval(ray))
@@ -266,8 +266,10 @@ def _unit(vector: Any, field: str) -> NDArray[np.float64]:
 
 
 def _lights(light: Light) -> dict[str, Any]:
-    """Sun and sky for `path`, which samples one at random for each shadow ray; black ones, which add noise, are
-    left out."""
+    """Return sun and sky for ``path``, which samples one at random for each shadow ray.
+
+    Black emitters would add noise and are omitted.
+    """
     found: dict[str, Any] = {"sun": _sun(light)} if any(light.sun_irradiance) else {}
     if light.environment is not None:
         found["sky"] = _mapped(light.environment.radiance, light.environment)
@@ -277,7 +279,7 @@ def _lights(light: Light) -> dict[str, Any]:
 
 
 def _ball(vertices: Sequence[NDArray[np.float64]]) -> tuple[Any, Any]:
-    """Centre, and square of the radius, of a ball around vertices (n, 3), with a margin for rounding."""
+    """Return the centre and squared radius of a bounding sphere of vertices (n, 3), with a margin for rounding."""
     every = np.concatenate(vertices)
     centre = 0.5 * (every.min(axis=0) + every.max(axis=0))
     square = float(np.max(np.sum((every - centre) ** 2, axis=1)))
@@ -292,7 +294,7 @@ def _sun(light: Light) -> dict[str, Any]:
 
 
 def _sky(light: Light) -> dict[str, Any]:
-    """The sky as an environment map, whose pole (row 0 of the map) is the zenith."""
+    """Return the sky as an environment map whose pole (row 0 of the map) is the zenith."""
     up = _unit(light.up, "up")
     side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     side /= np.linalg.norm(side)
@@ -304,7 +306,7 @@ def _sky(light: Light) -> dict[str, Any]:
 
 
 def _mapped(radiance: NDArray[np.float32], environment: Environment) -> dict[str, Any]:
-    """Mitsuba's environment map, whose middle looks along its z, with -x at its right and y at its pole."""
+    """Return Mitsuba's environment map: its centre is along z, its right side along -x, its pole along y."""
     return _environment_map(radiance, environment.frame_from_map @ np.diag([-1.0, -1.0, 1.0]))
 
 
@@ -316,10 +318,10 @@ def _environment_map(radiance: NDArray[np.float32], rotation: NDArray[np.float64
 
 
 def _loaded(material: Material) -> Any:
-    """Mitsuba's twosided BSDF of a material: diffuse, or diffuse below a clear coat.
+    """Return Mitsuba's twosided BSDF of a material: diffuse, or diffuse below a clear coat.
 
-    Dr.Jit pads a texture to four channels at its first use and only then drops the original; used one by one, the
-    textures of a scene take a third less memory at the peak than all at once in the first image.
+    Dr.Jit pads a texture to four channels at its first use, and only then frees the original. So each texture is
+    used once here: this takes a third less peak memory than padding all at once in the first image.
     """
     reflectance: Any
     if material.texture is None:
@@ -392,9 +394,9 @@ def _mesh(mesh: SceneMesh, bsdf: Any) -> Any:
         parameters["vertex_texcoords"] = np.ravel(uv).astype(np.float32)
     parameters.update()
     if mesh.normals is not None:
-        # New positions make Mitsuba recompute the normals, so ours come after them.
+        # Mitsuba recomputes normals after setting positions, so ours are set later.
         parameters["vertex_normals"] = np.ravel(mesh.normals).astype(np.float32)
         parameters.update()
-    # Last, because traversing a shape makes a second copy of the textures of its BSDF, which then stays.
+    # The BSDF is set last: traversing a shape would make a permanent second copy of its textures.
     shape.set_bsdf(bsdf)
     return shape

@@ -1,12 +1,12 @@
-"""The rolling-shutter camera: every ray leaves from the pose of its image row, or column.
+"""The rolling-shutter camera: every ray starts from the camera pose of its image row, or column.
 
 ``rs_pinhole`` is an ordinary Mitsuba sensor, so any Mitsuba integrator can render through it; rsbench's own
-renderers call its ``row_ray`` directly. Poses and intrinsics are data of the compiled kernel, never constants.
+renderers call its ``row_ray`` directly. Poses and intrinsics are inputs of the compiled kernel, never constants.
 
-Rays through a lens are undistorted in the kernel, in double precision, for every sample of a pixel separately. The
-host solves the pixel centres, and computes the inverse derivative there once. From these the chord method
-(Newton's with a constant derivative) solves each sample, at most half a pixel away; no ray is interpolated. The
-host determines the number of steps for the lens. NumPy: ``rsbench.core.camera.Lens.undistort``.
+The kernel undistorts every sample of a pixel separately, in double precision. The host undistorts the pixel
+centres and computes the inverse Jacobian there once. Starting from these, the chord method (Newton's with a
+constant Jacobian) solves each sample, at most half a pixel away; no ray is interpolated. The host determines the
+number of steps for the lens. The NumPy equivalent is ``rsbench.core.camera.Lens.undistort``.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from rsbench.core.se3 import Pose, inverse
 from rsbench.renderers.mitsuba_modules import dr, mi
 
 _EXACT_PX = 1e-8
-"""Largest error of an undistorted ray, px, in double precision; that of rounding to single precision is a thousand
-times larger."""
+"""Largest error of an undistorted ray, px, in double precision; rounding to single precision adds an error a
+thousand times larger."""
 _MOST_STEPS = 12
 _TRIED = 65
-"""Pixels along each side of the image that the host tests, including the outermost."""
+"""Number of pixels along each side of the image that the host tests, including the outermost."""
 
 
 class LensRays:
-    """Ideal coordinates of the pixels of one camera; numbers are data of the kernel, the model is its code."""
+    """Undistorts pixels of one camera in a kernel: parameters are its inputs, the lens model is compiled in."""
 
     def __init__(self, camera: PinholeCamera, lens: Lens) -> None:
         self.lens, self.width, self.steps = lens, dr.opaque(mi.UInt32, camera.width), chord_steps(camera, lens)
@@ -43,13 +43,13 @@ class LensRays:
         self._most = dr.opaque(mi.Float, camera.width - 1.0), dr.opaque(mi.Float, camera.height - 1.0)
         centres = camera.unproject(camera.pixel_grid())[..., :2].reshape(-1, 2)
         if lens.model == "kannala-brandt":
-            # With its tangent, which a GPU computes in single precision only.
+            # The tangent is stored too, because a GPU computes it in single precision only.
             tangent = np.hypot(centres[:, :1], centres[:, 1:])
             centres = np.concatenate([np.arctan(tangent), tangent], axis=1)
         self._start = [mi.Float64(np.ascontiguousarray(column)) for column in centres.T]
 
     def pixel(self, x: Any, y: Any, active: Any) -> tuple[Any, ...]:
-        """Values that all samples of the pixel around (x, y) share, for ``coordinates``."""
+        """Return the values that ``coordinates`` needs for all samples of the pixel around (x, y)."""
         if self.lens.model == "double-sphere":
             return ()
         column, row = (
@@ -64,7 +64,7 @@ class LensRays:
         return *start, xd, yd, by_y / determinant, -across / determinant, by_x / determinant
 
     def coordinates(self, x: Any, y: Any, pixel: tuple[Any, ...]) -> tuple[Any, Any]:
-        """Ideal coordinates, in single precision, of pixel coordinates (x, y) inside a pixel."""
+        """Return the undistorted coordinates x / z, y / z of pixel coordinates (x, y), in single precision."""
         solve = {"kannala-brandt": self._kannala, "double-sphere": self._spheres}.get(self.lens.model, self._brown)
         found = solve(*self._distorted(x, y), *pixel)
         return mi.Float(found[0]), mi.Float(found[1])
@@ -74,7 +74,7 @@ class LensRays:
         return [(mi.Float64(value) - centre) * rate for value, centre, rate in rates]
 
     def _derivative(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Symmetric derivative of the distortion: of x by x, of x by y, of y by y."""
+        """Return the Jacobian of the distortion, which is symmetric: its elements xx, xy and yy."""
         k1, k2, p1, p2, k3, k4, k5, k6, _, _ = self._k.values()
         s = x * x + y * y
         gain = 1 + s * (k1 + s * (k2 + s * k3))
@@ -104,7 +104,7 @@ class LensRays:
         return x, y
 
     def _spheres(self, xd: Any, yd: Any) -> tuple[Any, Any]:
-        """Closed form of the double sphere. NumPy: ``Lens.undistort``."""
+        """Undistort the double sphere model in closed form, as ``Lens.undistort`` does in NumPy."""
         *_, xi, alpha = self._k.values()
         s = xd * xd + yd * yd
         z = (1 - alpha * alpha * s) / (alpha * dr.sqrt(1 - (2 * alpha - 1) * s) + 1 - alpha)
@@ -113,7 +113,7 @@ class LensRays:
         return xd * gain, yd * gain
 
     def _slope(self, angle: Any) -> Any:
-        """Derivative of Kannala's radius by the angle."""
+        """Return the derivative of the distorted radius by the angle in the Kannala-Brandt model."""
         k1, k2, _, _, k3, k4, *_ = self._k.values()
         a = angle * angle
         return 1 + a * (3 * k1 + a * (5 * k2 + a * (7 * k3 + a * 9 * k4)))
@@ -125,7 +125,7 @@ class LensRays:
         for _ in range(self.steps):
             a = angle * angle
             angle = angle + rate * (radius - angle * (1 + a * (k1 + a * (k2 + a * (k3 + a * k4)))))
-        # tan(angle0 + turn) by the tangent of both; that of the turn, less than a pixel, by its series.
+        # tan(angle0 + turn) by the addition theorem; tan(turn) by its series, as turn is less than a pixel.
         turn = angle - angle0
         t = turn * turn
         tangent = turn * (1 + t * (1 / 3 + t * (2 / 15 + t * (17 / 315 + t * (62 / 2835)))))
@@ -137,12 +137,12 @@ class LensRays:
 
 @lru_cache(maxsize=2)
 def lens_rays(camera: PinholeCamera, lens: Lens) -> LensRays:
-    """The rays of a camera, computed once: the host needs seconds for the centres of a million pixels."""
+    """Return the rays of a camera; cached, because a million pixel centres take the host seconds."""
     return LensRays(camera, lens)
 
 
 def chord_steps(camera: PinholeCamera, lens: Lens) -> int:
-    """Number of steps after which the corners of pixels, the farthest samples, are exact to ``_EXACT_PX``."""
+    """Return the number of steps after which the corners of pixels, the worst case, are exact to ``_EXACT_PX``."""
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     axes = (np.unique(np.linspace(0, size - 1, _TRIED).round()) for size in (camera.width, camera.height))
     middles = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 1, 2)
@@ -161,29 +161,29 @@ def chord_steps(camera: PinholeCamera, lens: Lens) -> int:
 
 PLUGIN = "rs_pinhole"
 LEAST_COMPONENT = 1e-15
-"""Smaller components of a ray's direction, which are rounding, are set to 0. Embree treats one between -1e-18 and
-0 as negative and its inverse as positive: rays of its packet then miss surfaces."""
+"""Smaller components of a ray's direction are rounding errors and are set to 0. Embree treats a component between
+-1e-18 and 0 as negative but its inverse as positive, and rays in the same packet then miss surfaces."""
 
 
 def level(direction: Iterable[Any]) -> list[Any]:
-    """Components of a direction, of which those below ``LEAST_COMPONENT`` are 0."""
+    """Return the components of a direction, with magnitudes below ``LEAST_COMPONENT`` set to 0."""
     return [dr.select(dr.abs(value) < LEAST_COMPONENT, 0.0, value) for value in direction]
 
 
 def pose_table(
     camera: PinholeCamera, rotations: ArrayLike, translations: ArrayLike, columns: bool = False
 ) -> NDArray[np.float32]:
-    """Row poses as the kernels read them, (..., height, 12): ``R^T`` row-major, then the camera centre ``-R^T t``.
+    """Return row poses as the kernels read them, (..., height, 12): ``R^T`` row-major, then the centre ``-R^T t``.
 
     Args:
-        camera: its height is the number of poses.
+        camera: camera whose height is the number of poses.
         rotations: (..., height, 3, 3) world-to-camera rotations, one per row; a leading axis holds the instants of
             an exposure.
         translations: (..., height, 3) metres, with ``X_cam = R @ X_world + t``.
-        columns: whether columns are read, with one pose for each.
+        columns: whether the camera reads columns; then there is one pose per column.
 
     Raises:
-        RsbenchError: wrong shapes, or values that are not finite.
+        RsbenchError: the shapes are wrong, or a value is not finite.
     """
     R = np.asarray(rotations, dtype=np.float64)
     t = np.asarray(translations, dtype=np.float64)
@@ -208,10 +208,10 @@ def make_sensor(
     *,
     columns: bool = False,
 ) -> Any:
-    """A Mitsuba sensor ``rs_pinhole`` of ``camera``'s size with these row poses and a box filter.
+    """Make a Mitsuba sensor ``rs_pinhole`` of ``camera``'s size with these row poses and a box filter.
 
-    Args and errors: see ``pose_table``. Poses that are equal in all rows make a global shutter. ``objects`` are
-    the poses ``world_from_object`` of moving objects, with one more leading axis.
+    Arguments and errors are as for ``pose_table``. Equal poses in all rows give a global shutter. ``objects`` are
+    the poses ``world_from_object`` of the moving objects, with an additional leading axis for the objects.
     """
     sensor_class()
     film = {
@@ -230,7 +230,7 @@ def make_sensor(
 
 
 def object_tables(camera: PinholeCamera, objects: Pose | None, columns: bool) -> list[NDArray[np.float32]]:
-    """A table of each object as ``pose_table`` makes it: ``R`` row-major and ``t`` of ``world_from_object``."""
+    """Return one table per object, as from ``pose_table``: ``R`` row-major and ``t`` of ``world_from_object``."""
     if objects is None:
         return []
     tables = pose_table(camera, *inverse(objects), columns)
@@ -240,7 +240,7 @@ def object_tables(camera: PinholeCamera, objects: Pose | None, columns: bool) ->
 
 
 def _coordinates(sensor: Any, x: Any, y: Any, active: Any, pixel: Any) -> tuple[Any, Any]:
-    """Coordinates x / z, y / z of the ray through pixel coordinates (x, y)."""
+    """Return the coordinates x / z, y / z of the ray through pixel coordinates (x, y)."""
     if sensor.lens is not None:
         return sensor.lens.coordinates(x, y, sensor.lens.pixel(x, y, active) if pixel is None else pixel)
     if sensor.camera.lens is not None:  # one by one
@@ -251,12 +251,12 @@ def _coordinates(sensor: Any, x: Any, y: Any, active: Any, pixel: Any) -> tuple[
 
 
 def _held(table: NDArray[np.float32]) -> Any:
-    """A table as ``entries`` reads it."""
+    """Convert a table to the form that ``entries`` reads."""
     return mi.Float(table.ravel()) if dr.is_jit_v(mi.Float) else table.ravel().tolist()
 
 
 def entries(poses: Any, row: Any, active: Any) -> list[Any]:
-    """The 12 values of the pose of each lane's row."""
+    """Return the 12 values of the pose of each lane's row."""
     if not dr.is_jit_v(mi.Float):
         return list(poses[12 * int(row) : 12 * int(row) + 12])
     return [dr.gather(mi.Float, poses, row * 12 + k, active) for k in range(12)]
@@ -264,7 +264,7 @@ def entries(poses: Any, row: Any, active: Any) -> list[Any]:
 
 @cache
 def sensor_class() -> Any:
-    """The class behind the plugin ``rs_pinhole``, registered with the Mitsuba variant that is set."""
+    """Return the class of the plugin ``rs_pinhole`` after registering it with the current Mitsuba variant."""
     scalar = not dr.is_jit_v(mi.Float)
 
     class RSPinhole(mi.Sensor):
@@ -274,13 +274,13 @@ def sensor_class() -> Any:
             self.lens: Any = None
             self.poses: Any = None
             self.objects: list[Any] = []
-            """Poses of each object that moves, as many as those of the camera."""
+            """Poses of each moving object, at the same times as the poses of the camera."""
             self.columns = False
-            """Whether poses are those of columns."""
+            """Whether there is one pose per column instead of per row."""
             self.lines = 0
-            """Poses of an instant."""
+            """Number of poses per instant."""
             self.instants = 1
-            """Number of instants of an exposure: each row has as many poses."""
+            """Number of instants of an exposure, and so of poses per row."""
 
         def set_intrinsics(self, camera: PinholeCamera) -> None:
             values = (camera.fx, camera.fy, camera.cx, camera.cy)
@@ -290,21 +290,21 @@ def sensor_class() -> Any:
                 self.lens = lens_rays(camera, camera.lens)
 
         def set_poses(self, table: NDArray[np.float32], columns: bool = False) -> None:
-            """Table (lines, 12) or (instants, lines, 12) of ``pose_table``."""
+            """Set the poses from a table (lines, 12) or (instants, lines, 12) of ``pose_table``."""
             self.columns, self.lines = columns, table.shape[-2]
             self.instants = table.shape[0] if table.ndim == 3 else 1
             self.poses = _held(table)
 
         def set_objects(self, tables: Sequence[NDArray[np.float32]]) -> None:
-            """See ``object_tables``."""
+            """Set the poses of moving objects from ``object_tables``."""
             self.objects = list(map(_held, tables))
 
         def row_ray(self, x: Any, y: Any, row: Any, active: Any = True, pixel: Any = None) -> tuple[Any, Any]:
-            """World origin and direction of the ray through pixel coordinates (x, y), at the pose of ``row``.
+            """Return world origin and direction of the ray through pixel coordinates (x, y), at the pose ``row``.
 
-            With instants, pose ``row + lines * instant``; with columns, rows are columns. ``pixel`` is that of
-            ``lens``, found once for many samples. The direction has camera z = 1, so the distance to a hit in
-            units of it is the depth z.
+            With instants, ``row`` is ``row + lines * instant``; with columns, it counts columns. ``pixel`` is the
+            result of ``lens.pixel``, computed once for many samples. The direction has z = 1 in the camera frame,
+            so the ray parameter of a hit is its depth z.
             """
             u, v = _coordinates(self, x, y, active, pixel)
             p = entries(self.poses, row, active)
@@ -312,11 +312,11 @@ def sensor_class() -> Any:
             return mi.Point3f(p[9], p[10], p[11]), mi.Vector3f(*level(direction))
 
         def object_pose(self, number: int, row: Any, active: Any) -> list[Any]:
-            """The 12 values of the pose of an object, counted from 0."""
+            """Return the 12 values of the pose of an object; objects count from 0."""
             return entries(self.objects[number], row, active)
 
         def sample_ray(self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True) -> Any:
-            """Mitsuba's interface: film position in [0, 1]^2, whose pixel coordinate is half a pixel less."""
+            """Implement Mitsuba's interface; ``position`` in [0, 1]^2 counts from the corner of the film."""
             film = self.film()
             size, crop, offset = film.size(), film.crop_size(), film.crop_offset()
             x = position.x * crop[0] + offset[0]

@@ -1,4 +1,4 @@
-"""Rays between eyes and chosen points: what stands between them, what surface is met; a motion's collisions."""
+"""Visibility of points from camera centres, the surfaces that rays hit, and collisions of a moving rig."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from rsbench.renderers.scene import MitsubaScene
 from rsbench.renderers.sensor import LEAST_COMPONENT
 
 REACH = 1.0 - 1e-4
-"""Share of the distance to the point that must be free. The rest is the point's own surface: rays and points are
-rounded to float32, so a ray that grazes a surface meets it a little early."""
+"""Share of the distance to the point that must be unoccluded. The rest may contain the point's own surface: rays
+and points are rounded to float32, so a grazing ray hits the surface slightly too early."""
 
 
 class Surfaces(NamedTuple):
-    """What rays (n,) meet first."""
+    """First surfaces that n rays hit."""
 
     normals: NDArray[np.float32]
-    """(n, 3) of the triangles, towards the eye, world frame; 0 where nothing is met."""
+    """(n, 3) normals of the triangles, towards the eye, world frame; 0 for no hit."""
     instances: NDArray[np.uint16]
-    """(n,) numbers of meshes from 1, in the order of ``MitsubaScene.instances``; 0 where nothing is met."""
+    """(n,) numbers of meshes from 1, in the order of ``MitsubaScene.instances``; 0 for no hit."""
 
 
 @dataclass(frozen=True)
 class SceneRays:
-    """Rays through a scene; eyes and points (n, 3) are in its frame, metres."""
+    """Casts rays from eyes (n, 3) to points (n, 3), in the frame of the scene, metres."""
 
     scene: MitsubaScene
     objects: Sequence[MovingObject] = ()
-    """The scene's moving objects; without them rays meet only what stands still."""
+    """The scene's moving objects; if empty, rays only hit the static scene."""
 
     def blocked(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> NDArray[np.bool_]:
-        """Whether (n,) a surface stands before the points, at times (n,): where objects move, these are needed."""
+        """Return whether (n,) a surface occludes the points at times (n,), which moving objects require."""
         found = blocked(self.scene.scene, eyes, points)
         for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
             left = np.flatnonzero(~found)
@@ -52,16 +52,16 @@ class SceneRays:
         return found
 
     def share(self, eyes: FloatArray, points: FloatArray) -> FloatArray:
-        """Distance (n,) of the first surface on each ray, in units of the distance to the point; inf: none.
+        """Return the distance (n,) to the first static surface on each ray, relative to the point's; inf: none.
 
-        Of what stands still.
+        Moving objects are ignored.
         """
         hits = [self.scene.scene.ray_intersect_preliminary(ray, coherent=True) for ray in _rays(eyes, points)]
         met = np.concatenate([np.atleast_1d(np.array(hit.t, dtype=np.float64)) for hit in hits])
         return np.where(np.isfinite(met), met, np.inf)
 
     def surfaces(self, eyes: FloatArray, points: FloatArray, tau: FloatArray | None = None) -> Surfaces:
-        """What rays to the points, and beyond, meet first; ``tau`` as for ``blocked``."""
+        """Return the first surfaces on the rays to the points and beyond; ``tau`` as for ``blocked``."""
         met = _met(self.scene.scene, eyes, points)
         for scene, each in zip(self.scene.objects, self._objects(tau), strict=False):
             pose = each.world_from_object(np.asarray(tau))
@@ -83,11 +83,11 @@ class _Met(NamedTuple):
     normals: NDArray[np.float32]
     instances: NDArray[np.uint16]
     distance: NDArray[np.float32]
-    """(n,) in units of the distance to the point."""
+    """(n,) distance to the hit, relative to the distance to the point."""
 
 
 def blocked(scene: Any, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool_]:
-    """``SceneRays.blocked`` for one scene of Mitsuba."""
+    """Implement ``SceneRays.blocked`` for one Mitsuba scene."""
     found = [np.zeros(0, dtype=np.bool_)]
     for ray in _rays(eyes, points):
         ray.maxt = REACH
@@ -96,11 +96,11 @@ def blocked(scene: Any, eyes: FloatArray, points: FloatArray) -> NDArray[np.bool
 
 
 def _met(scene: Any, eyes: FloatArray, points: FloatArray) -> _Met:
-    """``SceneRays.surfaces`` for one scene of Mitsuba."""
+    """Implement ``SceneRays.surfaces`` for one Mitsuba scene."""
     found = []
     for ray in _rays(eyes, points):
         hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True)
-        dr.eval(hit.n, hit.t, hit.shape)  # together: evaluated one by one, each traces the rays again
+        dr.eval(hit.n, hit.t, hit.shape)  # in one call: separate evaluations would trace the rays again
         normals, directions = (np.array(each, dtype=np.float32).reshape(3, -1) for each in (hit.n, ray.d))
         numbers, distance = _numbers(scene, hit), np.atleast_1d(np.array(hit.t, dtype=np.float32))
         found.append((_towards_eyes(normals, directions, numbers), numbers, distance))
@@ -121,12 +121,12 @@ def _number(shape: Any) -> int:
 
 
 def _wide() -> bool:
-    """Whether the backend traces arrays of rays."""
+    """Return whether the backend traces arrays of rays."""
     return bool(dr.is_jit_v(mi.Float))
 
 
 def _rays(eyes: FloatArray, points: FloatArray) -> list[Any]:
-    """Rays whose parameter is 1 at the points: one array of all of them, or each alone."""
+    """Return rays whose parameter is 1 at the points: one array of rays, or single rays on scalar backends."""
     origins, directions = np.zeros((2, 3, len(points)), dtype=np.float32)
     _fill_rays(eyes, points, origins, directions)
     if _wide():
@@ -138,7 +138,7 @@ def _rays(eyes: FloatArray, points: FloatArray) -> list[Any]:
 def _fill_rays(
     eyes: FloatArray, points: FloatArray, origins: NDArray[np.float32], directions: NDArray[np.float32]
 ) -> None:
-    """Origins and directions (3, n) in one pass: NumPy's, a component at a time, takes as long as tracing them."""
+    """Fill origins and directions (3, n) in one pass: component-wise NumPy takes as long as tracing the rays."""
     for n in range(points.shape[0]):
         for k in range(3):
             direction = np.float32(points[n, k] - eyes[n, k])
@@ -150,7 +150,7 @@ def _fill_rays(
 def _towards_eyes(
     normals: NDArray[np.float32], directions: NDArray[np.float32], numbers: NDArray[np.uint16]
 ) -> NDArray[np.float32]:
-    """Normals (n, 3) of those (3, n) that are met along directions (3, n); 0 where the number (n,) is."""
+    """Flip normals (3, n) against the ray directions (3, n); return them as (n, 3), 0 where ``numbers`` is 0."""
     out = np.zeros((numbers.size, 3), np.float32)
     for n in np.flatnonzero(numbers):
         along = (
@@ -170,10 +170,11 @@ def obstacle(
     frames: int,
     objects: Sequence[MovingObject] = (),
 ) -> str:
-    """The obstacle that a camera meets, in words; "" where there is none. ``objects`` of the scene move.
+    """Describe the first surface or object that a camera collides with; return "" if there is none.
 
-    Followed in straight steps, from the middle of the rig at time 0 to each camera, and along its path until the
-    last row of the last of so many frames is read. A rig that starts inside a solid and stays there meets nothing.
+    Straight segments from the middle of the rig at time 0 to each camera, and along its path until the last row of
+    the last frame is read, are tested. A rig that starts and stays inside a solid is not detected. ``objects`` are
+    the moving objects of the scene.
     """
     for side in SIDES:
         tau = np.linspace(0.0, frames - 1 + shutter.ratio_of(side), 1 + 2 * (frames - 1) * rig.sensor(side).height)
@@ -191,9 +192,9 @@ def obstacle(
 
 
 def first_crossing(scene: Any, points: FloatArray) -> int | None:
-    """The first straight step, from point k of (n, 3), metres, to the next, that meets a surface; None: none.
+    """Return the first k for which the segment from point k to k + 1 of (n, 3), metres, hits a surface, or None.
 
-    ``scene`` is one of Mitsuba.
+    ``scene`` is a Mitsuba scene.
     """
     steps = np.diff(points, axis=0)
     moving = np.flatnonzero(np.any(steps, axis=1))

@@ -1,8 +1,8 @@
 """Tracing whole blocks of pixels at once with Dr.Jit (the variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``).
 
-A lane is one pixel. Embree traces neighbouring lanes together and does not promise that a lane's rounding is free
-of its neighbours. So the lanes of a row are padded to whole packets: as no packet straddles rows, a pixel has the
-same neighbours, and so the same bits, in a whole frame and in a row rendered by itself.
+A lane is one pixel. Embree traces neighbouring lanes together and does not guarantee that the rounding of a lane
+is independent of its neighbours. So the lanes of a row are padded to whole packets: as no packet straddles rows, a
+pixel has the same neighbours, and so the same bits, in a whole frame and in a row rendered alone.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from rsbench.renderers.pixel_samples import facet_points, instant_of, sky_points
 from rsbench.renderers.scene import MitsubaScene
 
 PACKET = 16
-"""Lanes that are traced together at most (AVX-512)."""
+"""Largest number of lanes that are traced together (AVX-512)."""
 LANES_PER_LAUNCH, _ON_GPU = 1 << 22, 8
-"""Bounds the memory of a launch, and how many times as many a GPU takes, which waits while launches are recorded;
-larger work is split, which changes no bit of the result."""
+"""Largest number of lanes of a launch, which bounds its memory, and the factor for a GPU, which idles while
+launches are recorded. Larger work is split without changing any bit of the result."""
 
 Float32Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class _Lanes:
-    """Pixels of a block of rows, repeated ``copies`` times.
+    """Lanes for the pixels of a block of rows, repeated ``copies`` times.
 
-    Sizes are data of the kernel and the numbers are counted inside it, so that neither another size nor the
-    alignment of host memory compiles a new kernel: a row by itself runs the very code of the whole frame.
+    The sizes are inputs of the kernel, and rows and columns are computed inside it, so that neither another size
+    nor the alignment of host memory compiles a new kernel: a single row runs the same code as a whole frame.
     """
 
     row: Any
@@ -58,21 +58,21 @@ class _Lanes:
         lane = dr.arange(mi.UInt32, shape[0] * shape[1] * shape[2])
         padded, count = dr.opaque(mi.UInt32, shape[2]), dr.opaque(mi.UInt32, len(rows))
         place, column = lane // padded, lane % padded
-        # Dr.Jit turns a table of one entry into other code, hence the second one.
+        # Dr.Jit compiles a table of one entry to different code, hence the second entry.
         table = mi.UInt32(np.asarray([*rows, rows[-1]], dtype=np.uint32))
         row = dr.gather(mi.UInt32, table, place % count)
         return cls(row, column, place // count, column < dr.opaque(mi.UInt32, width), shape)
 
     def line(self, sensor: Any) -> Any:
-        """Number of the row, or of the column where those are read."""
+        """Return the row, or the column if the camera reads columns."""
         return self.column if sensor.columns else self.row
 
     def pixel(self, camera: PinholeCamera) -> Any:
-        """Index of the pixel in the full frame."""
+        """Return the index of the pixel in the full frame."""
         return self.row * dr.opaque(mi.UInt32, camera.width) + self.column
 
     def image(self, channels: Sequence[Any], width: int) -> Float32Array:
-        """Host array (copies, rows, width, channels) of Dr.Jit arrays with one entry per lane."""
+        """Convert Dr.Jit arrays with one entry per lane to a host array (copies, rows, width, channels)."""
         dr.eval(channels)
         host = np.stack([np.array(channel).reshape(self.shape)[:, :, :width] for channel in channels], axis=-1)
         return host.astype(np.float32, copy=False)
@@ -87,7 +87,7 @@ def _most_lanes() -> int:
 
 
 def _bands(rows: Sequence[int], width: int) -> Iterator[tuple[slice, Sequence[int]]]:
-    """Rows of a launch, and their place among all."""
+    """Yield the rows of each launch, with their position among all rows."""
     step = max(1, _most_lanes() // _padded(width))
     for start in range(0, len(rows), step):
         place = slice(start, min(start + step, len(rows)))
@@ -95,7 +95,7 @@ def _bands(rows: Sequence[int], width: int) -> Iterator[tuple[slice, Sequence[in
 
 
 def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Hits:
-    """What the rays through pixel centres meet."""
+    """Return the first hits of the rays through the pixel centres."""
     result = Hits.none(len(rows), camera.width)
     for place, band in _bands(rows, camera.width):
         lanes = _Lanes.of(band, camera.width)
@@ -120,7 +120,7 @@ def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Se
 def radiance_rows(
     scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
 ) -> Float32Array:
-    """Linear RGB (rows, width, 3): the mean over the sub-pixel grid (a box filter)."""
+    """Return linear RGB (rows, width, 3): the mean over the sub-pixel grid (a box filter)."""
     trace = _sunsky_band if options.integrator == "sunsky" else _path_band
     result = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
     for place, band in _bands(rows, camera.width):
@@ -129,7 +129,7 @@ def radiance_rows(
 
 
 def _pose(sensor: Any, camera: PinholeCamera, lanes: _Lanes, sample: Any, options: RendererOptions) -> Any:
-    """Number of the pose that a sample of each lane is seen from: its row's, at an instant of the exposure."""
+    """Return the index of the pose of a sample of each lane: its row's pose at an instant of the exposure."""
     if sensor.instants == 1:
         return lanes.line(sensor)
     seed = dr.opaque(mi.UInt32, options.seed)
@@ -140,7 +140,7 @@ def _pose(sensor: Any, camera: PinholeCamera, lanes: _Lanes, sample: Any, option
 def _sunsky_band(
     scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
 ) -> Float32Array:
-    """The loop over samples runs inside the kernel, so memory does not grow with them."""
+    """Render a band with ``sunsky``; the loop over samples runs inside the kernel to keep memory constant."""
     lanes = _Lanes.of(rows, camera.width)
     grid = mi.Float(subpixel_grid(options.samples).ravel())
     count, rays = dr.opaque(mi.UInt32, options.samples), options.sky_rays
@@ -170,15 +170,18 @@ def _sunsky_band(
 
 
 def _entry(table: Any, number: Any) -> Any:
-    """Vector of a table of three numbers each."""
+    """Return a vector from a flat table with three numbers per entry."""
     return mi.Vector3f(*(dr.gather(mi.Float, table, 3 * number + k) for k in range(3)))
 
 
 def _path_band(
     scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
 ) -> Float32Array:
-    """One lane per pixel and sample, in passes; samples are added one after another whatever the passes."""
-    world = scene.textured()  # which evaluates what is recorded so far
+    """Render a band with ``path``, one lane per pixel and sample.
+
+    The samples are split into passes, but summed in the same order for any number of passes.
+    """
+    world = scene.textured()  # this evaluates all recorded operations
     offsets = mi.Float(subpixel_grid(options.samples).ravel())
     integrator, sampler = path_integrator(options.max_depth), lane_sampler()
     pixels = _Lanes.of(rows, camera.width)
@@ -200,7 +203,7 @@ def _path_band(
 
 
 def _added(total: Any, radiance: Any, copies: int) -> Any:
-    """The total of each pixel, and one copy of its radiance after another."""
+    """Add the copies of each pixel's radiance to its total, one after another."""
     dr.eval(total, radiance)
     place, step = dr.arange(mi.UInt32, dr.width(total)), dr.opaque(mi.UInt32, dr.width(total))
     last = dr.opaque(mi.UInt32, copies)

@@ -1,4 +1,4 @@
-"""Drawings of results as SVG: intervals in a table and beside each other, errors by problem, calibration."""
+"""SVG figures of results: values with intervals, errors by property of the problems, and calibration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WIDTH, _HEIGHT = 300, 190
 _LEFT, _BOTTOM, _TOP, _RIGHT = 44, 24, 8, 12
 _BINS = 5
 _APART = 2.5
-"""Px between the intervals of two lines at one place."""
+"""Horizontal distance, px, between the intervals of two entries at one value."""
 _SEED = 0
 _DASHES = ("", "6 3", "2 2", "8 3 2 3", "1 3", "10 4")
 _MARKS = (
@@ -33,20 +33,20 @@ _MARKS = (
     "M0 4L4 -3H-4z",
     "M-3 -3L3 3M-3 3L3 -3",
 )
-"""Colours of board.css.j2 suit any colour vision; marks and dashes differ too."""
+"""Marks. The colours of board.css.j2 suit any colour vision; entries differ in marks and dashes too."""
 MOST_LINES = len(_MARKS)
 _NOTHING = 1e-6
-"""The truth errs by less, and is not drawn: it would stretch the axis."""
+"""Median error below which an oracle is not drawn, as it would stretch the axis."""
 
 
 class ErrorLine(NamedTuple):
-    """Errors of an entry."""
+    """The errors of an entry, drawn as one line."""
 
     name: str
     errors: FloatArray
     """(n,) in the order of the problems."""
     grey: bool
-    """Whether it is drawn grey, as an oracle."""
+    """Whether it is an oracle, drawn in grey."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +58,12 @@ class _Curve:
     at: FloatArray
     """Medians (parts,)."""
     ends: FloatArray
-    """Ends (parts, 2) of their intervals; infinite where the values bound nothing."""
+    """Ends (parts, 2) of their intervals; infinite if there are too few values for an interval."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Axis:
-    """Scores to px, from the top."""
+    """Vertical axis: converts scores to px from the top."""
 
     low: float
     high: float
@@ -73,7 +73,7 @@ class _Axis:
         return _TOP + (1.0 - self.share(value)) * (_HEIGHT - _TOP - _BOTTOM)
 
     def share(self, value: float) -> float:
-        """Where a value is between the ends, 0 to 1."""
+        """Position of a value between the ends of the axis, 0 to 1."""
         low, high, at = (self._place(x) for x in (self.low, self.high, min(max(value, self.low), self.high)))
         return (at - low) / (high - low)
 
@@ -94,7 +94,7 @@ class _Axis:
 
 
 def bar(value: float, low: float, high: float) -> Markup:
-    """A value in [0, 1] with its interval; what it shows stands beside it as text."""
+    """Draw a value in [0, 1] with its interval; hidden from screen readers, as a text beside it has the number."""
     x, a, b = (1.0 + _BAR * min(max(each, 0.0), 1.0) for each in (value, low, high))
     return Markup(
         f'<svg width="{_BAR + 2}" height="12" aria-hidden="true"><path d="M1 6H{_BAR + 1}" stroke="currentColor" '
@@ -107,7 +107,7 @@ def bar(value: float, low: float, high: float) -> Markup:
 
 
 def legend(lines: Sequence[ErrorLine]) -> Markup:
-    """Which mark is whose."""
+    """Legend: the line and mark of each entry."""
     items = []
     for line, (style, dash, mark) in zip(lines, _styles(lines), strict=True):
         drawn = f'<path d="M0 7h34" {_stroke(style, dash)}/>{_mark(17.0, 7.0, style, mark)}'
@@ -116,21 +116,21 @@ def legend(lines: Sequence[ErrorLine]) -> Markup:
 
 
 def drawable(lines: Sequence[ErrorLine]) -> list[ErrorLine]:
-    """The first ``MOST_LINES`` entries, and oracles that err."""
+    """Select the first ``MOST_LINES`` entries, and all oracles with errors."""
     ranked = [line for line in lines if not line.grey][:MOST_LINES]
     return ranked + [line for line in lines if line.grey and np.median(line.errors) > _NOTHING]
 
 
 def curves(facts: pd.Series, lines: Sequence[ErrorLine], scenes: Sequence[str]) -> Markup | None:
-    """Median errors with their intervals in parts of the problems: by words, by few values, else by fifths.
+    """Draw median errors with intervals by a property: one point for each word or value, or for fifths if many.
 
     Args:
-        facts: (n,) numbers or words of the problems.
-        lines: what ``drawable`` gives.
-        scenes: (n,) of the problems: their intervals keep those of a scene together.
+        facts: (n,) property of each problem, numbers or words.
+        lines: result of ``drawable``.
+        scenes: (n,) scene of each problem; if a scene has several, bootstrap intervals resample whole scenes.
 
     Returns:
-        None where the problems have fewer than two values.
+        None if the property has fewer than two different values.
     """
     parts = _parts(facts)
     if parts is None or not lines:
@@ -146,7 +146,7 @@ def curves(facts: pd.Series, lines: Sequence[ErrorLine], scenes: Sequence[str]) 
 
 
 def _parts(facts: pd.Series) -> tuple[NDArray[np.intp], Sequence[float | str]] | None:
-    """The part of each problem, and what the parts are called: words, or medians."""
+    """Group the problems: the group of each, and the label of each group, a word, value or median."""
     if not pd.api.types.is_numeric_dtype(facts):
         words, part = np.unique(facts.astype(str).to_numpy(), return_inverse=True)
         return None if len(words) < 2 else (part, [str(word) for word in words])
@@ -163,7 +163,7 @@ def _parts(facts: pd.Series) -> tuple[NDArray[np.intp], Sequence[float | str]] |
 
 def _typical(errors: FloatArray, where: NDArray[np.bool_], clusters: NDArray[np.str_] | None) -> Triple:
     inside = np.sort(errors[where])
-    if clusters is None or len(set(clusters[where])) < 2:  # problems of one scene are drawn independently
+    if clusters is None or len(set(clusters[where])) < 2:  # problems of one scene are independent
         low, high = (inside[int(k)] if np.isfinite(k) else k for k in _bracket(len(inside)))
     else:
         low, high = typical_interval(errors[where], _SEED, clusters[where].tolist())
@@ -172,12 +172,12 @@ def _typical(errors: FloatArray, where: NDArray[np.bool_], clusters: NDArray[np.
 
 @lru_cache
 def _bracket(n: int) -> Interval:
-    """Ranks, from 0, of the ends of the exact interval of a median; infinite where there is none."""
+    """Ranks, from 0, of the ends of the exact interval of a median of n values; infinite if there is none."""
     return median_interval(np.arange(n))
 
 
 def _styles(lines: Sequence[ErrorLine]) -> list[tuple[str, str, str]]:
-    """Colour, dash and mark of each."""
+    """Colour, dash and mark of each entry."""
     coloured = iter([(f"var(--c{k})", _DASHES[k], _MARKS[k]) for k in range(MOST_LINES)])
     return [("var(--grey)", "", "") if line.grey else next(coloured) for line in lines]
 
@@ -208,7 +208,7 @@ def _drawn(labels: Sequence[float | str], drawn: Sequence[_Curve]) -> Markup:
 
 
 def _across(labels: Sequence[float | str]) -> FloatArray:
-    """Places of the parts, px."""
+    """Horizontal positions of the groups, px."""
     words = isinstance(labels[0], str)
     inset = 0.5 * (_WIDTH - _LEFT - _RIGHT) / len(labels) if words else 12.0
     x = np.array([k if isinstance(label, str) else label for k, label in enumerate(labels)], dtype=np.float64)
@@ -218,7 +218,8 @@ def _across(labels: Sequence[float | str]) -> FloatArray:
 
 
 def _axis(drawn: Sequence[_Curve]) -> _Axis:
-    """Axis that shows all medians and the finite ends of their intervals; logarithmic where nothing is 0."""
+    """Axis that contains all medians and the finite ends of their intervals; logarithmic if all are positive and
+    differ by a factor of 3 or more."""
     every = np.concatenate([np.concatenate([each.at, each.ends.ravel()]) for each in drawn])
     known = every[np.isfinite(every)]
     low, high = float(np.min(known)), float(np.max(known))
@@ -236,7 +237,7 @@ def _frame(labels: Sequence[float | str], across: FloatArray, axis: _Axis) -> li
     last = -math.inf
     for a, label in zip(across, labels, strict=True):
         word = _word(label)
-        if a - last >= 6.0 * len(word) + 4.0:  # room for it
+        if a - last >= 6.0 * len(word) + 4.0:  # enough room
             last = float(a)
             marks.append(f'<text x="{a:.1f}" y="{_HEIGHT - 7}" text-anchor="middle">{escape(word)}</text>')
     return marks
@@ -247,7 +248,7 @@ def _word(label: float | str) -> str:
 
 
 def short(value: float) -> str:
-    """Number with two digits, or without decimals."""
+    """Format a number with two digits, or from 100 on without decimals."""
     return f"{value:.2g}" if abs(value) < 100.0 else f"{value:.0f}"
 
 
@@ -265,7 +266,7 @@ def _mark(a: float, b: float, style: str, mark: str) -> str:
 
 
 def reliability(covers: Sequence[Triple]) -> Markup:
-    """Shares of truths within the ellipsoids of the levels, against those that should be."""
+    """Draw the share of true values within the stated ellipsoid of each level, against the level."""
     side, width = 150.0, 190
 
     def place(x: float, y: float) -> str:
@@ -294,10 +295,10 @@ def reliability(covers: Sequence[Triple]) -> Markup:
     return Markup("".join(parts) + "</svg>")
 
 
-# Dots with intervals, a row for each of what is compared: the pictures of pages of results
+# Plots of dots with intervals, a row for each compared item, for pages of results
 
 _PLOT, _ROW, _HEAD, _INSET = 540, 20, 34, 12
-"""Width, height of a row and of the titles, inset of a panel, px: on a phone letters of 12 px are 8 px high."""
+"""Width, height of a row, height of titles, inset of a panel, px; on a phone, letters of 12 px have 8 px."""
 _SERIES = (("#0072b2", _MARKS[0]), ("#c44e00", _MARKS[1]))
 _INK = (
     "text{font:12px system-ui,sans-serif;fill:#1d2126;paint-order:stroke;stroke:#fff;stroke-width:4px}"
@@ -306,11 +307,11 @@ _INK = (
 
 
 class DotRow(NamedTuple):
-    """A row of a plot of dots; without values the heading of the rows below."""
+    """A row of a plot of dots; a row without values is a heading of the rows below."""
 
     label: str
     values: Sequence[Sequence[Triple]] = ()
-    """For each panel the value of each series with the ends of its interval; NaN where there is none."""
+    """For each panel, the value of each series with the ends of its interval; NaN if there is none."""
 
 
 class DotPanel(NamedTuple):
@@ -318,18 +319,18 @@ class DotPanel(NamedTuple):
 
     title: str
     scale: str
-    """What its axis measures."""
+    """Title of its axis."""
     low: float = 0.0
     high: float = 1.0
     logarithmic: bool = False
 
 
 def dots(panels: Sequence[DotPanel], rows: Sequence[DotRow], series: Sequence[str] = ()) -> Markup:
-    """Panels beside each other with the same rows: a file of its own, black on white.
+    """Draw panels side by side that share their rows, as the content of an SVG file, black on white.
 
     Args:
-        panels: from the left.
-        rows: from the top.
+        panels: panels from left to right.
+        rows: rows from top to bottom.
         series: names of the values in a row, if there are several.
     """
     left = 8.0 + 6.7 * max(len(row.label) for row in rows if row.values)
@@ -361,7 +362,7 @@ def dots(panels: Sequence[DotPanel], rows: Sequence[DotRow], series: Sequence[st
 
 
 def _panel(panel: DotPanel, start: float, width: float, ends: tuple[int, int]) -> list[str]:
-    """Titles and grid."""
+    """Draw titles and grid of a panel."""
     middle, (top, bottom) = start + 0.5 * width, ends
     parts = [
         f'<text x="{middle:.0f}" y="{top - 12}" text-anchor="middle">{escape(panel.title)}</text>',
@@ -384,7 +385,7 @@ def _share(panel: DotPanel, value: float) -> float:
 
 
 def _whisker(panel: DotPanel, start: float, width: float, y: float, triple: Triple, series: int) -> list[str]:
-    """A value and its interval; nothing where there is none."""
+    """Draw a value and its interval, as far as they are finite."""
     x, a, b = (start + width * _share(panel, each) if np.isfinite(each) else math.nan for each in triple)
     line = f"M{a:.1f} {y:.1f}H{b:.1f}M{a:.1f} {y - 3:.1f}v6M{b:.1f} {y - 3:.1f}v6"
     parts = [f'<path d="{line}" stroke="{_SERIES[series][0]}" fill="none"/>'] if np.isfinite([a, b]).all() else []

@@ -170,7 +170,7 @@ def read_split(board: Path, protocol: str, split: str) -> Board:
 
 
 def fact_title(name: str) -> str:
-    """``rotation_deg`` as people write it."""
+    """Return a readable title of a property such as ``rotation_deg``."""
     found = re.fullmatch(r"(\w+)_(deg|m|px)", name)
     return (f"{found[1]} ({found[2]})" if found else name).replace("_", " ")
 
@@ -180,18 +180,18 @@ BRIEF = 2
 
 
 def as_csv(lines: Sequence[Standing], secret: bool) -> str:
-    """All numbers of a table with all digits. No cell begins like a formula, because names cannot."""
+    """Return all numbers of a table with all digits. No cell is a formula, as names cannot start like one."""
     return table(lines, worst=not secret).to_csv(index=False, lineterminator="\n")
 
 
 def as_markdown(lines: Sequence[Standing]) -> str:
-    """The most important columns; in names of methods, only underscores have a meaning in Markdown."""
+    """Return the most important columns as Markdown; underscores in names, their only markup, are escaped."""
     head, *rows = _brief(lines)
     return "\n".join(table_lines(head, rows)).replace("_", r"\_") + "\n"
 
 
 def as_latex(lines: Sequence[Standing]) -> str:
-    """The same table as a LaTeX tabular with the rules of booktabs."""
+    """Return the most important columns as a LaTeX tabular with the rules of booktabs."""
     head, *rows = [" & ".join(row).replace("_", r"\_") + r" \\" for row in _brief(lines)]
     width = len(_brief(lines)[0])
     begin, end = rf"\begin{{tabular}}{{ll{'r' * (width - 2)}}}", r"\end{tabular}"
@@ -403,7 +403,7 @@ def _at_hand(each: Board, data: Sequence[Path]) -> tuple[Split | None, Path | No
             except RsbenchError:
                 if not (folder / "dataset.json").is_file():
                     raise
-                continue  # whose cameras this track does not support
+                continue  # the track does not support its cameras
             if split.fingerprint == each.fingerprint:
                 return split, folder
     return None, None
@@ -418,7 +418,7 @@ def entry_context(each: Board, line: Standing, album: Album) -> dict[str, Any]:
     header = line.scored.header
     fields = asdict(header)
     uses = set(header.uses)
-    # The best of the other entries that use no more, and the oracles.
+    # The entry is compared with the best other one that uses no more inputs, and with the oracles.
     peers = [peer for peer in each.by_score if peer is not line and set(peer.scored.header.uses) <= uses]
     oracles = [other for other in each.lines if other.rank is None and other is not line]
     compared = [line, *(peers[:1] if line.rank else []), *oracles]
@@ -629,7 +629,7 @@ def build_site(board: Path, out: Path, data: Sequence[Path] = (), *, problem_pag
 
 
 def _other_sections(out: Path, names: Collection[str]) -> list[dict[str, Any]]:
-    """Sections of an existing first page, without those named, and without those whose table no longer exists."""
+    """Sections of an existing first page whose tables still exist, without those with these ``names``."""
     path = out / "index.html"
     page = path.read_text("utf-8") if path.is_file() else ""
     found = re.findall(r'<section class="split" id="([^"]+)".*?</section>', page, re.DOTALL)
@@ -746,7 +746,7 @@ def _row(each: Board, line: Standing) -> dict[str, Any]:
 
 
 def _apart(triple: tuple[float, float, float]) -> dict[str, str]:
-    """Text of a number, and of its interval, which is shown only with all columns."""
+    """Split a number and its interval into two texts; the interval is shown only with all columns."""
     number, space, interval = format_interval(*triple).partition(" ")
     return {"text": number, "interval": space + interval}
 

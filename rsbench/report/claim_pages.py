@@ -1,4 +1,4 @@
-"""The tables of claims as pages of Markdown."""
+"""Pages of Markdown with the verdicts on the paper's claims."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ Read "more stable" and "no impact" beside the errors: a solver that errs as much
 
 
 def claims_page(table: pd.DataFrame, best: pd.DataFrame) -> str:
-    """Markdown: an overview, then per claim the paper's words, the rule, and verdicts with their figures."""
+    """Return the page: an overview, then for each claim the paper's words, the rule, and verdicts with figures."""
     claims = [line for claim in CLAIMS for line in _claim(claim, table, best)]
     return "\n".join([_CLAIMS, *summary(best), *_overview(best), *claims])
 
 
 def summary(best: pd.DataFrame) -> list[str]:
-    """The verdicts on the paper's solver, both readings of the noise side by side."""
+    """Lines of a table of verdicts on the paper's solver, with both readings of the noise side by side."""
     lines = []
     for (claim, matches), rows in best.groupby(["claim", "matches"], sort=False):
         verdicts = [row[name] for row in rows.to_dict("records") for name in ("literal", "best")]
@@ -62,7 +62,7 @@ def summary(best: pd.DataFrame) -> list[str]:
 
 
 def _overview(best: pd.DataFrame) -> list[str]:
-    """The same with the share of readings for which the claim holds, and ours."""
+    """Lines of a table of verdicts, with the number of readings for which a claim holds, and on our solver."""
     lines = []
     for row in best.to_dict("records"):
         holding = f"{row['holding']} of {row['readings']} hold"
@@ -104,7 +104,7 @@ the rules were chosen when earlier results were known; the figures stand beside 
 
 
 def image_claims_page(table: pd.DataFrame) -> str:
-    """Markdown: the paper's words, the rule, and verdicts with their figures."""
+    """Return the page: for each claim the paper's words, the rule, and verdicts with figures."""
     lines = [_IMAGES]
     for claim in IMAGE_CLAIMS:
         lines += [f"## {claim.key[0].upper()}{claim.key[1:]}", "", f"{claim.text}.", ""]
@@ -133,7 +133,7 @@ _UNITS = {
 
 
 def readings_page(settings: pd.DataFrame) -> str:
-    """Markdown from the table of ``claims.holding_settings``."""
+    """Return the page for the table of ``claims.holding_settings``."""
     grid = [f"- {name}{_UNITS.get(name, '')}: {low} or {high}" for name, (low, high) in SETTINGS.items()]
     names = list(dict.fromkeys(settings.reading))
     head = ["claim", "settings", *(word for name in names for word in (f"{name}: holds", "fails"))]
@@ -160,7 +160,7 @@ SHOWN_NOISE_PX = 0.3
 
 
 def sweeps_page(cards: list[SweepCard], tables: Mapping[str, pd.DataFrame]) -> str:
-    """Markdown that describes each table, with the figures that README shows."""
+    """Return the page, which describes each table and shows some figures."""
     lines = [*_solvers(tables["solvers"]), "", *_bound(tables["limit"]), "", *_wrong(tables["wrong-readout"])]
     lines += ["", *_wrong_motion(tables["wrong-motion"])]
     head = ("table", "what", "varies", "noise (px)", "trials", "RANSAC")
@@ -175,7 +175,7 @@ def _row(card: SweepCard) -> tuple[str, ...]:
 
 
 def _solvers(table: pd.DataFrame) -> list[str]:
-    """All solvers at one noise."""
+    """Lines about all solvers at one noise."""
     rows = table[table.value == SHOWN_NOISE_PX]
     lines = [
         f"## All solvers at {SHOWN_NOISE_PX:g} px",
@@ -188,7 +188,7 @@ def _solvers(table: pd.DataFrame) -> list[str]:
 
 
 def _figures(table: pd.DataFrame, head: Sequence[str], figures: Sequence[str], names: Sequence[str]) -> list[str]:
-    """A line for each row: its subject, and figures with their intervals."""
+    """Lines of a table: for each row the columns ``names``, and ``figures`` with their intervals."""
     rows = table.to_dict("records")
     named = [[f"{row[name]:g}" if name == "value" else row[name] for name in names] for row in rows]
     return table_lines(
@@ -198,14 +198,14 @@ def _figures(table: pd.DataFrame, head: Sequence[str], figures: Sequence[str], n
 
 
 def _bound(table: pd.DataFrame) -> list[str]:
-    """Errors over the bound."""
+    """Lines about errors relative to the Cramer-Rao bound."""
     lines = ["## Errors over the Cramer-Rao bound", "", "Root mean squares.", ""]
     head = ("solver", "noise", "matches per camera", "e_R over bound", "e_T over bound")
     return lines + _figures(table, head, ("e_R_over_bound", "e_T_over_bound"), ("solver", "variant", "value"))
 
 
 def _wrong(table: pd.DataFrame) -> list[str]:
-    """Errors with a wrong given readout ratio."""
+    """Lines about errors if the given readout ratio is wrong."""
     noise = "0.1 px, 2 deg, 0.3 m, 100 matches per camera, or tracks; medians."
     head = ("solver", "sees", "given minus true", "e_R (deg)", "e_T (deg)")
     figures = _figures(table, head, ("e_R_median", "e_T_median"), ("solver", "information", "value"))
@@ -213,7 +213,7 @@ def _wrong(table: pd.DataFrame) -> list[str]:
 
 
 def _wrong_motion(table: pd.DataFrame) -> list[str]:
-    """Errors on data that follow another motion model than the solver's."""
+    """Lines about errors on data whose motion model differs from the solver's."""
     solvers = list(table.solver.unique())
     lines = [
         "## Data of another motion model",

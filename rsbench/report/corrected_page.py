@@ -247,7 +247,7 @@ _BY_EACH = "corrected by each camera alone: the motion of the rig does not expla
 
 
 def _otherwise(frames: Any) -> list[tuple[str, str]]:
-    """Numbers of the frames that are as they were read, or corrected by each camera alone, by the reason."""
+    """Numbers of the frames that were not corrected or were corrected by each camera alone, with the reason."""
     reasons = dict[str, list[int]]()
     for each in frames if isinstance(frames, list) else []:
         if reason := each.get("reason", _BY_EACH if "alone" in each else ""):
@@ -310,8 +310,8 @@ def _one_motion(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def _eight_bit(image: NDArray[Any], scaled_by: NDArray[Any] | None = None) -> Image:
-    """Convert an image to RGB uint8; 16 bits, which may be used only in part, are scaled by the maximum of the
-    image or of another array."""
+    """Convert an image to RGB uint8. 16-bit images, which may use few of their bits, are scaled by the 99.9th
+    percentile of the image or of ``scaled_by``."""
     if image.dtype != np.uint8:
         top = max(float(np.percentile(image if scaled_by is None else scaled_by, 99.9)), 1.0)
         image = np.clip(image * (255.0 / top), 0.0, 255.0).astype(np.uint8)

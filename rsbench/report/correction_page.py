@@ -49,7 +49,7 @@ _LINES = {
 
 
 def _page(folder: Path, text: str) -> Path:
-    """Write README.md; returns it."""
+    """Write README.md and return its path."""
     write_bytes(folder / "README.md", text.encode())
     return folder / "README.md"
 
@@ -138,7 +138,7 @@ def _with_gain(row: pd.Series) -> str:
 
 
 def _sections(images: pd.DataFrame, summary: pd.DataFrame, stratum: str) -> dict[str, str]:
-    """Mask of one stratum, and its tables over all sequences and by scene."""
+    """Text on the mask of one stratum, and its tables over all sequences and by scene."""
     own = images[images["stratum"] == stratum]
     mask = masks(own).iloc[0]
     share = (
@@ -151,7 +151,7 @@ def _sections(images: pd.DataFrame, summary: pd.DataFrame, stratum: str) -> dict
 
 
 def _scene_tables(scenes: pd.DataFrame) -> tuple[str, str]:
-    """Covered PSNR / PSNR of all pixels by scene, dB; and the gain of ours over each method, dB, covered."""
+    """Two tables by scene, dB: PSNR of covered / of all pixels; gain of ours over each method, covered pixels."""
     names = list(dict.fromkeys(scenes["scene"]))
     counts = scenes.groupby("scene")["sequences"].first()
     headings = [f"{name} ({counts[name]})" for name in names]
@@ -231,7 +231,7 @@ def _findings(images: pd.DataFrame, summary: pd.DataFrame) -> str:
 
 @contextmanager
 def _drawn(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
-    """Context of a figure, which is written at the end: SVG with text; equal data give equal bytes."""
+    """Yield a figure and write it as SVG at the end, with text as text; equal data give equal files."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -325,7 +325,7 @@ def _errors(summary: pd.DataFrame) -> str:
 
 
 def draw_frames(frames: dict[str, NDArray[np.uint8]], path: Path) -> Path:
-    """Draw pictures of one size side by side, each below its name."""
+    """Draw pictures of one size side by side, each with its name in its upper left corner."""
     small = [pictures.label(pictures.shrink(frame, _LONGEST).copy(), name) for name, frame in frames.items()]
     white = np.full((small[0].shape[0], _GAP, 3), 255, dtype=np.uint8)
     row = [part for image in small for part in (image, white)][:-1]
@@ -364,7 +364,7 @@ def sgm_page(table: pd.DataFrame) -> str:
 
 
 def _underestimate(delayed: pd.DataFrame) -> dict[str, Any]:
-    """The case in which the first-order formula, with the matcher's own error, underestimates most."""
+    """Find the case in which the first-order formula with the matcher's own error underestimates most."""
     floors = delayed[delayed["delay"] == 0.0].set_index(["stratum", "sequence"])["error_px"]
     later = delayed[delayed["delay"] > 0.0]
     floor = floors.loc[list(zip(later["stratum"], later["sequence"], strict=True))].to_numpy()
@@ -374,7 +374,7 @@ def _underestimate(delayed: pd.DataFrame) -> dict[str, Any]:
 
 
 def _tolerable(delayed: pd.DataFrame) -> str:
-    """Delay that causes an error of 0.1 px in each sequence: the predicted error is proportional to it."""
+    """Text: the delay for an error of 0.1 px in each sequence; the predicted error is proportional to it."""
     longest = delayed[delayed["delay"] == max(DELAYS)]
     parts = []
     for _, row in longest.iterrows():

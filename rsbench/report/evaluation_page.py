@@ -51,7 +51,7 @@ def write_pictures(sequence: Sequence, out: Path, chosen: dict[str, str], hash_o
     """Write pictures/<sequence>/NAME.jpg below ``out``; returns the captions by NAME.
 
     Args:
-        sequence: with the truth.
+        sequence: sequence with the truth.
         out: folder of the evaluation.
         chosen: names of corrector, solver and matcher whose predictions are drawn.
         hash_of: gives the SHA-256 of a file of the sequence.
@@ -86,7 +86,7 @@ def _corrected_stem(folder: Path, chosen: dict[str, str]) -> Path:
 
 
 def _files_drawn(folder: Path, chosen: dict[str, str]) -> list[Path]:
-    """Predictions that the pictures show."""
+    """Files of the predictions that the pictures show."""
     stem, depth = _corrected_stem(folder, chosen), folder / "depth" / f"{chosen['matcher']}.npz"
     corrected = [stem.with_name(f"{stem.name}{end}.png") for end in ("", "-origin")]
     inliers = folder / "motion" / f"{chosen['solver']}-inliers.npz"

@@ -1,4 +1,4 @@
-"""Pages from templates, and tables in Markdown."""
+"""Render templates, and format tables in Markdown."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rsbench.benchmark.statistics import format_interval
 
-if TYPE_CHECKING:  # it takes half a second to load
+if TYPE_CHECKING:  # loading it takes half a second
     import pandas as pd
 
 
 def rendered(template: str, *, trim: bool = False, **values: Any) -> str:
-    """Text of a template of ``rsbench.report``; a value that the template lacks is an error.
+    """Render a template of ``rsbench.report``; a variable of the template without a value is an error.
 
-    In HTML what values hold is escaped. ``trim``: lines of instructions alone leave no empty lines.
+    Values are escaped in HTML. ``trim``: remove the line break after a template tag.
     """
     html = template.endswith(".html.j2")
     environment = Environment(
@@ -30,18 +30,18 @@ def rendered(template: str, *, trim: bool = False, **values: Any) -> str:
 
 
 def table_lines(head: Sequence[object], rows: Iterable[Iterable[object]]) -> list[str]:
-    """The lines of a table in Markdown."""
+    """Return the lines of a table in Markdown."""
     lines = [f"| {' | '.join(map(str, cells))} |" for cells in (head, *rows)]
     return [lines[0], "|" + "---|" * len(head), *lines[1:]]
 
 
 def frame_text(table: pd.DataFrame) -> str:
-    """A data frame, without its index, as a table in Markdown."""
+    """Format a data frame, without its index, as a table in Markdown."""
     return "\n".join(table_lines(list(table), table.itertuples(index=False)))
 
 
 def words_of(row: Mapping[Any, Any], name: str) -> str:
-    """The number of the columns of ``with_ends`` with its interval; a dash where there is none."""
+    """Format a number and its interval from the columns that ``with_ends`` names; a dash for NaN."""
     import pandas as pd
 
     value, low, high = (row[name + end] for end in ("", "_low", "_high"))

@@ -37,7 +37,7 @@ _X_LABELS = {
 }
 _Y_LABELS = {"e_R": r"$e_R$ (deg)", "e_T": r"$e_T$ (deg)"}
 _LOG_X = ("noise", "translation", "rotation")
-# Okabe and Ito's colours, which readers of all colour vision tell apart; line and marker do so in grey.
+# Okabe and Ito's colours are distinct for any colour vision; lines and markers also differ, for print in grey.
 _STYLES: dict[str, dict[str, Any]] = {
     "rs-stereo-linear": {"color": "#D55E00", "linestyle": "-", "marker": "o"},
     "rs-stereo-linear-symmetric": {"color": "#CC79A7", "linestyle": "-.", "marker": "s"},
@@ -55,7 +55,7 @@ _LABELS = {
     "rs-stereo-refined-pairs": "maximum likelihood *",
 }
 COLUMN_MM = 88.0
-"""Width of a column in print."""
+"""Width of a printed column, mm."""
 _INCH_MM = 25.4
 _COLUMN_IN, _WIDE_IN = (COLUMN_MM / _INCH_MM, 6.3), (13.2, 6.0)
 _COLUMN: dict[str, Any] = {
@@ -70,10 +70,10 @@ _TICK_DECADES = 2
 
 
 def read_summaries(folder: Path, sweeps: tuple[str, ...]) -> dict[str, pd.DataFrame]:
-    """Stored summaries ``<sweep>.csv`` by the name of the sweep.
+    """Read the stored summaries ``<sweep>.csv``, by the name of the sweep.
 
     Raises:
-        RsbenchError: one is missing or damaged.
+        RsbenchError: a file is missing or damaged.
     """
     tables = {}
     for name in sweeps:
@@ -85,9 +85,9 @@ def read_summaries(folder: Path, sweeps: tuple[str, ...]) -> dict[str, pd.DataFr
 
 
 def draw_fig3(folder: Path) -> list[Path]:
-    """Draw the figure for both readings and both statistics next to the summaries; returns the files.
+    """Draw Figure 3 for both readings of the noise and both statistics into ``folder``; returns the files.
 
-    Equal summaries give equal bytes.
+    Equal summaries give equal files.
     """
     tables = read_summaries(folder, SWEEPS)
     paths: list[Path] = []
@@ -98,7 +98,7 @@ def draw_fig3(folder: Path) -> list[Path]:
 
 
 def _draw_fig3(tables: dict[str, pd.DataFrame], variant: str, centre: Centre, stem: Path) -> list[Path]:
-    """For a column in print as PDF, and for a screen as PNG."""
+    """Draw the figure as PDF for a printed column, and as PNG for a screen."""
     paths = [stem.with_suffix(ending) for ending in (".pdf", ".png")]
     with _style(_COLUMN):
         metadata: dict[str, Any] = {"CreationDate": None, "Producer": None, "Creator": None}
@@ -109,13 +109,13 @@ def _draw_fig3(tables: dict[str, pd.DataFrame], variant: str, centre: Centre, st
 
 
 def fig3(tables: dict[str, pd.DataFrame], variant: str, centre: Centre, *, upright: bool) -> Figure:
-    """The figure: sweeps in the order of the paper's columns, rotation beside direction, one scale for each.
+    """Draw the figure: sweeps in the paper's order; one scale for errors of rotation, one for those of direction.
 
     Args:
-        tables: of ``read_summaries``.
+        tables: result of ``read_summaries``.
         variant: reading of the noise.
-        centre: what is drawn of the trials.
-        upright: a row for each sweep, else a column.
+        centre: statistic over the trials.
+        upright: whether each sweep is a row of panels, instead of a column.
     """
     from matplotlib.figure import Figure
 
@@ -150,7 +150,7 @@ def fig3(tables: dict[str, pd.DataFrame], variant: str, centre: Centre, *, uprig
 
 
 def _curves(axes: Axes, table: pd.DataFrame, measure: str, centre: Centre) -> None:
-    """Curves with 95 % bands over the values of one sweep, and the bound of the same statistic."""
+    """Draw a curve with 95 % band for each solver of one sweep, and the bound of the same statistic."""
     for solver, rows in table.groupby("solver", sort=False):
         style = _STYLES.get(str(solver), _OTHER)
         key = f"{measure}_{centre}"
@@ -174,7 +174,7 @@ def _scales(axes: Axes, table: pd.DataFrame, name: str) -> None:
 
 
 def _tick_decades(axes: Axes) -> None:
-    """Every other decade: panels are low, and share their scale."""
+    """Put ticks at every other decade, as the panels are low."""
     from matplotlib.ticker import FixedLocator, NullFormatter
 
     low, high = (math.log10(end) for end in axes.get_ylim())
@@ -188,7 +188,7 @@ def _tick_decades(axes: Axes) -> None:
 
 @contextmanager
 def _style(more: dict[str, Any] | None = None) -> Iterator[None]:
-    """matplotlib without the user's settings and anything that differs between runs."""
+    """Use fixed settings of matplotlib, so that files do not depend on the user or the run."""
     from matplotlib import rc_context, style
 
     settings: Any = {
@@ -206,7 +206,7 @@ def _style(more: dict[str, Any] | None = None) -> Iterator[None]:
 
 
 def setting_table(cards: list[SweepCard]) -> pd.DataFrame:
-    """What each sweep holds fixed; most of it is not in the paper."""
+    """Table of the fixed settings of each sweep, most of which the paper does not state."""
     rows = []
     for card in cards:
         s: Setting = card.setting
@@ -261,7 +261,7 @@ What the paper does not state had to be chosen:
 
 
 def fig3_page(settings: pd.DataFrame) -> str:
-    """Markdown around the figures, with the table of ``setting_table``."""
+    """Return the page of Figure 3 as Markdown, with the result of ``setting_table``."""
     return _PAGE + frame_text(settings) + "\n"
 
 
@@ -274,9 +274,9 @@ TITLES = (
     "(f) depth error",
 )
 ERROR_M = (0.001, 2.0)
-"""Ends of the logarithmic scale of depth errors, metres: less than is usual indoors, and the paper's limit."""
+"""Ends of the logarithmic scale of depth errors, metres: below usual errors indoors, and the paper's limit."""
 INVENTED = (0, 190, 255)
-"""Colour of depth where there is no surface; none of the scale's."""
+"""Colour of depth where there is no surface; it is not in the colour map."""
 _COLOURS = 256
 _PIXELS = {"pdf": 210, "jpg": 250}
 _JPEG = {"subsampling": 0, "optimize": True}
@@ -284,12 +284,12 @@ _WIDTH_IN, _TEXT_IN, _HEAD_IN, _BAR_IN, _GAP_IN = 7.2, 0.56, 0.2, 0.2, 0.03
 
 
 def draw_fig4(rows: list[tuple[str, Panels]], stem: Path, quality: int = 84) -> list[Path]:
-    """Draw named rows into ``stem``.pdf and ``stem``.jpg; returns the files. Equal panels give equal bytes.
+    """Draw rows of panels to ``stem``.pdf and ``stem``.jpg; returns the files. Equal panels give equal files.
 
     Args:
-        rows: drawn one below the other.
-        stem: of the files' names.
-        quality: of the JPEG, 1 to 95.
+        rows: name and panels of each row, from the top.
+        stem: path of the files without suffix.
+        quality: quality of the JPEG, 1 to 95.
     """
     from matplotlib import rc_context
 
@@ -333,7 +333,7 @@ def _draw(rows: list[tuple[str, Panels]], path: Path, pixels: int, quality: int)
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """A colour scale: its ends in what is drawn, and the ticks there."""
+    """A colour scale. Ends and ticks (text and value) are in the unit of the drawn values."""
 
     low: float
     high: float
@@ -342,7 +342,7 @@ class Scale:
 
 
 def depth_scale(panels: Panels) -> Scale:
-    """Scale of inverse depth, 1/m, without the nearest and farthest hundredth of the surfaces; ticks in metres."""
+    """Scale of inverse depth, 1/m, from the 1st to the 99th percentile of the surfaces; ticks show metres."""
     low, high = np.nanpercentile(1.0 / panels.true_depth, [1, 99])
     even = (low + np.linspace(0.0, 1.0, 4) * (high - low)).tolist()
     texts = [f"{1.0 / value:.2g} m" if k == 0 else f"{1.0 / value:.2g}" for k, value in enumerate(even)]
@@ -357,7 +357,7 @@ def _error_scale() -> Scale:
 
 
 def _draw_scale(figure: Any, place_in: tuple[float, float, float, float], scale: Scale) -> None:
-    """A bar with ticks below; left, bottom, width and height in inches."""
+    """Draw a colour bar with ticks below; ``place_in``: left, bottom, width and height, inches."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -373,9 +373,9 @@ def _draw_scale(figure: Any, place_in: tuple[float, float, float, float], scale:
 
 
 def panel_images(panels: Panels) -> list[Image]:
-    """The six panels as RGB images."""
+    """Return the six panels as RGB images."""
     depth, error = depth_scale(panels), _error_scale()
-    # No error at all is below the scale, as its smallest value is.
+    # Smaller errors, also of 0, get the lowest value of the scale.
     size = np.log10(np.maximum(panels.depth_error, ERROR_M[0]))
     errors = pictures.colour_map(size, error.low, error.high, error.colours)
     errors[np.isinf(panels.depth_error)] = INVENTED
@@ -390,7 +390,7 @@ def panel_images(panels: Panels) -> list[Image]:
 
 
 def caption(name: str, n: dict[str, Any]) -> tuple[str, ...]:
-    """The lines under a row."""
+    """Return the lines of text below a row."""
     filled = n["share_other_camera"] + n["share_other_frame"]
     literal = ", ".join(n[option] for option in LITERAL if option in n)
     holes, by = ("black", f" ({literal})") if literal else ("inpainted", "")
@@ -422,7 +422,7 @@ def _percent(share: float) -> str:
 
 
 def few_colours(image: Image) -> Image:
-    """The image in 256 colours: a third of the bytes in a file, and no difference at the size of a panel."""
+    """Reduce an image to 256 colours: files are a third as large, and look equal at the size of a panel."""
     from PIL import Image as Pillow
 
     reduced = Pillow.fromarray(image).quantize(_COLOURS, method=Pillow.Quantize.MEDIANCUT)

@@ -1,4 +1,4 @@
-"""Pictures of reports: overlays, depth and error maps, matches, 8-bit RGB arrays or JPEG bytes; and of a rig."""
+"""Pictures of reports as 8-bit RGB arrays: overlays, depth and error maps, matches; JPEG; drawing of a rig."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ INLIER, OUTLIER, INVALID = (70, 160, 255), (255, 150, 0), (60, 60, 66)
 
 
 def overlay(first: Image, second: Image, mask: NDArray[np.bool_] | None = None) -> Image:
-    """Two images in one: ``first`` in red, ``second`` in cyan, so that agreement is grey and shifts are coloured.
+    """Overlay two images, ``first`` in red and ``second`` in cyan: agreement is grey, shifts are coloured.
 
     Pixels outside ``mask`` are dark.
     """
@@ -31,7 +31,7 @@ def overlay(first: Image, second: Image, mask: NDArray[np.bool_] | None = None) 
 
 
 def masked(image: Image, mask: NDArray[np.bool_]) -> Image:
-    """``image`` with the pixels outside ``mask`` dark."""
+    """Return the image with pixels outside ``mask`` set to dark grey."""
     return np.where(mask[..., None], image, np.array(INVALID, dtype=np.uint8))
 
 
@@ -39,7 +39,7 @@ _MAPS = {"viridis": cv2.COLORMAP_VIRIDIS, "magma": cv2.COLORMAP_MAGMA, "inferno"
 
 
 def colour_map(values: ArrayLike, low: float, high: float, name: str = "viridis") -> Image:
-    """Values (H, W) in a colour map of matplotlib, between ``low`` and ``high``; others are dark grey."""
+    """Colour values (H, W) by a colour map from ``low`` to ``high``, clipped; non-finite values are dark grey."""
     v = (np.asarray(values, dtype=np.float64) - low) / max(high - low, 1e-12)
     known = np.isfinite(v)
     levels = np.where(known, np.clip(256.0 * v, 0.0, 255.0), 0.0).astype(np.uint8)
@@ -49,7 +49,7 @@ def colour_map(values: ArrayLike, low: float, high: float, name: str = "viridis"
 
 
 def draw_matches(image: Image, matches: FloatArray, inliers: NDArray[np.bool_]) -> Image:
-    """Arrows of at most 400 matches (n, 4) on the image of frame 0, to frame 1: inliers blue, outliers orange."""
+    """Draw at most 400 matches (n, 4) to frame 1 as arrows on frame 0; inliers are blue, outliers orange."""
     grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) // 2 + 64
     out = np.ascontiguousarray(grey.astype(np.uint8))
     chosen = np.linspace(0, len(matches) - 1, min(400, len(matches))).astype(int)
@@ -61,7 +61,7 @@ def draw_matches(image: Image, matches: FloatArray, inliers: NDArray[np.bool_]) 
 
 
 def label(image: Image, text: str) -> Image:
-    """The image with a word or two in its upper left corner, light on a dark bar."""
+    """Write a short text into the upper left corner, light on a dark bar."""
     out, font = np.ascontiguousarray(image), cv2.FONT_HERSHEY_SIMPLEX
     (width, height), below = cv2.getTextSize(text, font, 0.45, 1)
     out[: height + below + 8, : width + 12] = INVALID
@@ -70,7 +70,7 @@ def label(image: Image, text: str) -> Image:
 
 
 def shrink(image: Image, longest: int) -> Image:
-    """Image no larger than ``longest`` pixels on a side, area-averaged."""
+    """Shrink an image to at most ``longest`` pixels per side, by area averaging."""
     scale = longest / max(image.shape[:2])
     if scale >= 1.0:
         return image
@@ -86,7 +86,7 @@ def encode_jpeg(image: Image, quality: int = 88) -> bytes:
 
 
 def jpeg_uri(data: bytes) -> str:
-    """A JPEG file as a URI that needs no network and no second file."""
+    """Return a JPEG file as a data URI."""
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
 
 
@@ -94,7 +94,7 @@ _COLOURS = {"left": "#3b82f6", "right": "#ea580c"}
 
 
 def draw_rig(rig: StereoRig, path: Path) -> None:
-    """Write the picture; its suffix, .svg, .png or .pdf, is its format. Lengths are metres in the body's axes."""
+    """Draw a rig, in metres in the body's axes, to a file; the suffix (.svg, .png or .pdf) gives the format."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")

@@ -1,5 +1,4 @@
-"""Tables and pages of points: recorded trajectories (errors, coverage, chosen models), and public and held-out
-splits side by side."""
+"""Pages of results on points: recorded trajectories, and the comparison of public with held-out splits."""
 
 from __future__ import annotations
 
@@ -26,15 +25,15 @@ from rsbench.storage.files import write_bytes
 SPLINE = "continuous"
 """The choice if no motion model fits."""
 LIMITS = (0.0, 1.0, 3.0, 10.0, np.inf)
-"""Classes of the departure from constant angular velocity, in standard deviations of the noise of a match."""
+"""Limits of classes of deviations from constant angular velocity, in standard deviations of a match's noise."""
 _UNKNOWNS = 6
 
 
 def by_recording(entries: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """A row for each entry and recording: medians of the errors and coverage of what is stated, with intervals.
+    """A row for each entry and recording: median errors and coverage of stated covariances, with intervals.
 
     Args:
-        entries: tables of scores of the same problems by the name of the entry.
+        entries: tables of scores by the name of the entry; all have the same problems.
     """
     return pd.DataFrame(
         {"method": name, "recording": recording, "problems": len(part), **_numbers(part)}
@@ -44,11 +43,10 @@ def by_recording(entries: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 
 
 def choices(split: Split, entries: Mapping[str, pd.DataFrame], method: str) -> pd.DataFrame:
-    """A row for each problem: the chosen model, errors, and the departure of the rows from constant angular
-    velocity.
+    """A row for each problem: chosen model, errors, and deviation of the motion from constant angular velocity.
 
-    ``departure_px`` is the largest angle between the true pose of a row and that of an even turn by the true w,
-    times the focal length.
+    ``departure_px`` is the largest angle, over the rows, between the true pose and that of a rotation by the true
+    w at constant speed, times the focal length.
     """
     scores = entries[method][["problem", "recording", "chosen", "e_R_deg", "e_T_deg", "e_row_deg", "nees"]]
     focal = np.array([truth.rig.camera.fx for truth in split.truths])
@@ -69,7 +67,7 @@ def _numbers(scores: pd.DataFrame) -> dict[str, float]:
 
 
 def write_recorded_page(folder: Path) -> Path:
-    """README.md from recordings.csv, choices.csv and, if there, resampling.csv of a folder; returns it."""
+    """Write README.md from recordings.csv, choices.csv and, if it exists, resampling.csv in ``folder``."""
     recordings, chosen = (pd.read_csv(folder / f"{name}.csv") for name in ("recordings", "choices"))
     resampling = folder / "resampling.csv"
     text = recorded_page(recordings, chosen, pd.read_csv(resampling) if resampling.is_file() else None)
@@ -78,12 +76,12 @@ def write_recorded_page(folder: Path) -> Path:
 
 
 def recorded_page(recordings: pd.DataFrame, chosen: pd.DataFrame, resampling: pd.DataFrame | None) -> str:
-    """The page in Markdown.
+    """Return the page as Markdown.
 
     Args:
-        recordings: as of ``by_recording``.
-        chosen: as of ``choices``.
-        resampling: errors of the recordings, by benchmarks/recorded_motion.py; left out if None.
+        recordings: result of ``by_recording``.
+        chosen: result of ``choices``.
+        resampling: errors of the recordings, from benchmarks/recorded_motion.py; None: omitted.
     """
     about = (
         "The recordings (`benchmarks/recorded_motion.py`): *left out* is the error of a spline through every\n"
@@ -186,10 +184,10 @@ OURS = "rsbench"
 
 
 def compared(dev: Sequence[Scored], test: Sequence[Scored]) -> pd.DataFrame:
-    """A row for each entry of a track that has answered both splits, the best on the public one first.
+    """A row for each entry with results on both splits, sorted by the score on the public split, the best first.
 
-    ``score`` is the first score of the track, ``rank`` that among these entries, ``covers_95`` the coverage of the
-    stated 95 % ellipsoids, and ``difference`` the held-out score minus the public one, with Welch's interval.
+    ``score`` is the primary score, ``rank`` the rank among these entries, ``covers_95`` the coverage of the stated
+    95 % ellipsoids, and ``difference`` the held-out score minus the public one, with Welch's interval.
     """
     both = {each.header.method for each in dev} & {each.header.method for each in test}
     lines = {
@@ -206,7 +204,7 @@ def compared(dev: Sequence[Scored], test: Sequence[Scored]) -> pd.DataFrame:
 
 
 def difference(first: FloatArray, second: FloatArray) -> tuple[float, float, float]:
-    """Mean of the second values minus that of the first, independent ones, and the ends of Welch's interval."""
+    """Mean of the second sample minus that of the first, independent one, and the ends of Welch's interval."""
     parts = np.array([np.var(each, ddof=1) / len(each) for each in (first, second)])
     degrees = parts.sum() ** 2 / np.sum(parts**2 / (np.array([len(first), len(second)]) - 1))
     half = float(stdtrit(degrees, 0.5 + 0.5 * COVERAGE) * np.sqrt(parts.sum()))
@@ -227,14 +225,14 @@ def _of_split(split: str, line: Standing) -> dict[str, Any]:
 
 
 def write_held_out_page(folder: Path, about: Mapping[str, Any]) -> Path:
-    """README.md from scores.csv of a folder and what was announced; returns it."""
+    """Write README.md from scores.csv in ``folder``; ``about``: content of announced.json. Returns the file."""
     text = held_out_page(pd.read_csv(folder / "scores.csv", keep_default_na=True), about)
     write_bytes(folder / "README.md", text.encode())
     return folder / "README.md"
 
 
 def held_out_page(table: pd.DataFrame, about: Mapping[str, Any]) -> str:
-    """The page in Markdown: of ``compared`` of several tracks, and of the announcement."""
+    """Return the page as Markdown, from results of ``compared`` for several tracks, and announced.json."""
     parts = [
         "# Public and held-out splits",
         "Made by `rsbench reproduce held-out`; all numbers are in [scores.csv](scores.csv), the boards in\n"
@@ -265,7 +263,7 @@ def _comparison(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def others(table: pd.DataFrame) -> pd.DataFrame:
-    """Entries by other people's code, with their scores on public splits, sorted by the number of inputs."""
+    """Entries whose code is not rsbench's, with their scores on public splits, sorted by the number of inputs."""
     found = dict[str, dict[str, str]]()
     rows = table[table["code"] != OURS].to_dict("records")
     for row in sorted(rows, key=lambda row: (row["uses"].count("+"), row["uses"])):

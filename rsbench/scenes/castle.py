@@ -47,7 +47,7 @@ class CastleBuilder(PartsBuilder):
 
 
 def terrain_height(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Height of the land: level inside the walls, hills around them that close the horizon."""
+    """Return the height of the land: level inside the walls, with hills around them that hide the horizon."""
     distance = np.hypot(x, y - 3.0)
     rise = np.clip((distance - 34.0) / 45.0, 0.0, 1.0)
     rolling = 1.6 * np.sin(x * 0.11 + 1.0) * np.cos(y * 0.09) + 0.7 * np.sin(x * 0.27 + y * 0.21)

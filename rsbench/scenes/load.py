@@ -1,11 +1,11 @@
-"""Scene cards: parsed, built or taken from the cache of built scenes, and lit, perhaps by an environment map.
+"""Scene cards: parsing, building with a cache of built scenes, and lighting, also by environment maps.
 
-Our builders take seconds, and every process wants the same arrays. A scene is one file of the cache, named by what
-decides its arrays. It is written under another name and renamed when complete, so processes may fill the cache at
-the same time; zip's checksums detect a damaged file, which is built again.
+Our builders take seconds, and every process needs the same arrays. The cache has one file per scene, named by a
+hash of everything that affects its arrays. A file is renamed when complete, so that several processes can fill the
+cache at the same time; zip's checksums detect a damaged file, which is then built again.
 
-An environment map is light from all directions in place of the two-colour sky, from a lat-long HDR or EXR file.
-The middle of the map looks along +y of the scene, its right side along +x; its upper border is the zenith.
+An environment map, a lat-long HDR or EXR file, replaces the two-colour sky by light from all directions. The
+centre of the map is in direction +y of the scene, its right side in direction +x; its upper border is the zenith.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ from rsbench.storage.untrusted_files import check_amount, read_bytes
 from rsbench.storage.work_folder import cpu_key, user_cache
 
 _PACKAGES = ("numpy", "trimesh", "shapely", "mapbox-earcut")
-"""Decide, with the sources of ``rsbench.scenes``, what our builders make of a card."""
+"""Packages that affect the meshes of our builders, besides the sources of ``rsbench.scenes``."""
 _MOST = 12
-"""Scenes that are kept: 0.2 GB each."""
+"""Largest number of scenes in the cache: 0.2 GB each."""
 _ABANDONED_S = 3600.0
 _ARRAYS = ("vertices", "faces", "uv", "normals")
 
 
 def built_key(builder: SceneBuilder, seed: int) -> str | None:
-    """Equal keys are equal meshes on one machine; None when files or other packages' code decide too."""
+    """Return a key that identifies meshes on one machine; None if they depend on files or other packages' code."""
     if not builder.closed or type(builder).__module__.partition(".")[0] != "rsbench":
         return None
     package = Path(str(resources.files("rsbench")))
@@ -71,7 +71,7 @@ def built_key(builder: SceneBuilder, seed: int) -> str | None:
 
 
 def cached_meshes(key: str) -> tuple[SceneMesh, ...] | None:
-    """Meshes that ``keep`` stored under a key; None where nothing can be read."""
+    """Return the meshes that ``keep`` stored under a key, or None if they cannot be read."""
     folder = _folder()
     if folder is None:
         return None
@@ -79,14 +79,14 @@ def cached_meshes(key: str) -> tuple[SceneMesh, ...] | None:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             meshes = tuple(_unpacked(arrays))
-        os.utime(path)  # the least recently used goes first
-    except Exception:  # whatever a damaged file makes of those who read it
+        os.utime(path)  # ``_trim`` removes the least recently used
+    except Exception:  # a damaged file may cause any exception in NumPy or in our code
         return None
     return meshes
 
 
 def keep(key: str, meshes: tuple[SceneMesh, ...]) -> None:
-    """Store meshes; silently does nothing where nothing can be written."""
+    """Store meshes in the cache; do nothing if it cannot be written."""
     folder = _folder()
     if folder is None:
         return
@@ -112,7 +112,7 @@ def _folder() -> Path | None:
 
 
 def _trim(folder: Path) -> None:
-    """Make room for one more scene; what a killed process left goes too."""
+    """Make room for one more scene, and remove partial files of killed processes."""
     kept = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
     for path in kept[: max(len(kept) - _MOST + 1, 0)]:
         path.unlink(missing_ok=True)
@@ -122,7 +122,7 @@ def _trim(folder: Path) -> None:
 
 
 def _packed(meshes: tuple[SceneMesh, ...]) -> dict[str, NDArray[Any]]:
-    """Arrays by name, and everything else as JSON; meshes that share a material share it again."""
+    """Return arrays by name, and everything else as JSON; shared materials are stored once."""
     materials = list({id(mesh.material): mesh.material for mesh in meshes}.values())
     numbers = {id(material): number for number, material in enumerate(materials)}
     arrays: dict[str, NDArray[Any]] = {}
@@ -156,15 +156,15 @@ PIXELS = 1 << 23
 _CHANNELS = 16
 _REC_709 = np.array([0.2126, 0.7152, 0.0722])
 _SUN_DEG, _RING_DEG, _SUNNY = 5.0, 8.0, 50.0
-"""How far from the brightest pixel the sun's light is looked for, how far what lies around it, and how many times
-as bright as the median of the upper half it must be."""
+"""Radius of the sun's disc around the brightest pixel, outer radius of the ring that estimates its background, and
+least ratio of that pixel's brightness to the median of the upper half."""
 
 
 def read_environment(path: Path) -> NDArray[np.float32]:
-    """Linear radiance (H, 2 H, 3) of a Radiance HDR or an EXR file; its size is read before it is decoded.
+    """Read linear radiance (H, 2 H, 3) from a Radiance HDR or EXR file, after checking its size.
 
     Raises:
-        RsbenchError: it cannot be read, is too large, not twice as wide as high, or holds what is no light.
+        RsbenchError: the file cannot be read, is too large, not twice as wide as high, or has invalid radiance.
     """
     data, kind = read_bytes(path), path.suffix.lower()
     if kind not in (".hdr", ".exr"):
@@ -173,7 +173,7 @@ def read_environment(path: Path) -> NDArray[np.float32]:
         radiance = _read_exr(data, path) if kind == ".exr" else _read_hdr(data, path)
     except RsbenchError:
         raise
-    except Exception as error:  # what a damaged file makes its decoder stumble over
+    except Exception as error:  # decoders raise various exceptions for damaged files
         raise RsbenchError(f"environment map {path}: damaged, or no {kind[1:].upper()} file") from error
     if not (np.isfinite(radiance).all() and radiance.min() >= 0.0 and radiance.max() > 0.0):
         raise RsbenchError(
@@ -218,17 +218,17 @@ def _read_exr(data: bytes, path: Path) -> NDArray[np.float32]:
 
 
 def lit_by(light: Light, radiance: NDArray[np.float32], turn_deg: float) -> Light:
-    """The light of a map, which makes level ground in the open as bright as ``light`` does.
+    """Return the light of an environment map, scaled so that open level ground is as bright as under ``light``.
 
-    A sun in the map becomes the light's sun, so that it throws shadows without noise; a map without one has none.
+    A sun in the map becomes the directional sun, whose shadows have no noise; otherwise there is no sun.
 
     Args:
-        light: in the frame of the scene, z up; its sun and sky only say how bright all is.
-        radiance: of ``read_environment``.
-        turn_deg: the map is turned by this much, anticlockwise from above.
+        light: light in the frame of the scene, z up; its sun and sky only set the brightness.
+        radiance: radiance from ``read_environment``.
+        turn_deg: rotation of the map, degrees anticlockwise seen from above.
 
     Raises:
-        RsbenchError: no light comes from above.
+        RsbenchError: the upper half of the map is black.
     """
     directions, weights = _directions(radiance.shape[0])
     sky, direction, irradiance = _without_sun(radiance.astype(np.float64), directions, weights)
@@ -248,18 +248,18 @@ def lit_by(light: Light, radiance: NDArray[np.float32], turn_deg: float) -> Ligh
 
 
 _SCENE_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""The map's axes are those of a camera that looks at its middle: x right, y down, z forward."""
+"""The map's axes are those of a camera that looks at the map's centre: x right, y down, z forward."""
 
 
 def _directions(height: int) -> tuple[FloatArray, FloatArray]:
-    """Unit directions (H, 2 H, 3) of a map's pixels in the frame of the scene, and solid angles (H, 1)."""
+    """Return unit directions (H, 2 H, 3) of a map's pixels in the scene frame, and solid angles (H, 1)."""
     edges = np.cos(np.pi * np.arange(height + 1) / height)
     directions = _around(np.pi * (np.arange(height) + 0.5) / height, height)
     return directions, (edges[:-1] - edges[1:])[:, None] * np.pi / height
 
 
 def _around(down: FloatArray, height: int) -> FloatArray:
-    """Unit directions (n, 2 H, 3) at angles (n) from the zenith, in the columns of a map of height H."""
+    """Return unit directions (n, 2 H, 3) at angles (n) from the zenith, for the columns of a map of height H."""
     around = np.pi * ((np.arange(2 * height) + 0.5) / height - 1.0)
     level = np.sin(down)[:, None]
     return np.stack(
@@ -270,7 +270,7 @@ def _around(down: FloatArray, height: int) -> FloatArray:
 def _without_sun(
     radiance: FloatArray, directions: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A map (H, W, 3) with what lies around its sun in its place, the sun's direction (3,) and irradiance (3,)."""
+    """Replace a map's sun by the surrounding radiance; return map, sun direction (3,) and irradiance (3,)."""
     bright = radiance @ _REC_709
     upper = bright[: len(bright) // 2]
     peak = np.unravel_index(int(np.argmax(upper)), upper.shape)
@@ -287,16 +287,16 @@ def _without_sun(
 
 
 def _at_edges(radiance: FloatArray) -> NDArray[np.float32]:
-    """Values (H + 1, W, 3) at the edges of rows, the poles first and last."""
+    """Interpolate values (H + 1, W, 3) at the edges of rows; the first and last are the poles."""
     top, bottom = (np.broadcast_to(np.mean(radiance[row], axis=0), (1, *radiance.shape[1:])) for row in (0, -1))
     between = 0.5 * (radiance[:-1] + radiance[1:])
     return np.concatenate([top, between, bottom]).astype(np.float32)
 
 
 def irradiance_map(radiance: NDArray[np.float32], rows: int = 32) -> NDArray[np.float32]:
-    """Radiance (rows + 1, 2 rows, 3) of white diffuse surfaces that are open to a map (H + 1, 2 H, 3).
+    """Return the radiance (rows + 1, 2 rows, 3) of unoccluded white diffuse surfaces under a map (H + 1, 2 H, 3).
 
-    Their normals lie as the values of ``Environment.radiance`` do.
+    The directions of the surface normals are arranged as in ``Environment.radiance``.
     """
     height = min(len(radiance) - 1, 4 * rows)
     middle = 0.5 * (radiance[:-1] + radiance[1:])
@@ -314,7 +314,7 @@ Rgb: TypeAlias = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class LightCard:
-    """``Light`` with the sun given as people give it."""
+    """``Light`` with the direction of the sun given by azimuth and elevation."""
 
     sun_azimuth_deg: float = 220.0
     """Direction of the sun in the scene frame, degrees anticlockwise from +x."""
@@ -327,10 +327,10 @@ class LightCard:
     sky_horizon: Rgb = (0.75, 0.85, 0.95)
     """Linear RGB radiance of the sky at the horizon."""
     environment: str = ""
-    """Lat-long .hdr or .exr file, relative to the card, that replaces sun and sky; these then say only how bright
-    it is."""
+    """Lat-long .hdr or .exr file, relative to the card, that replaces sun and sky; these then only set its
+    brightness."""
     environment_turn_deg: float = 0.0
-    """Turn of the environment map, degrees anticlockwise from above; at 0 the middle of the map looks along +y."""
+    """Rotation of the environment map, degrees anticlockwise from above; at 0 its centre is in direction +y."""
 
     def __post_init__(self) -> None:
         if not 0 < self.sun_elevation_deg <= 90:
@@ -353,16 +353,16 @@ class LightCard:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCard:
-    """What a scene card holds."""
+    """Content of a scene card."""
 
     name: str
-    """Name of the scene, which is that of the card's file."""
+    """Name of the scene, equal to that of the card's file."""
     builder: str
     """Name of a scene builder, or ``package.module:Class``; the module may lie beside the card."""
     parameters: dict[str, Any] = field(default_factory=dict)
     """Parameters of the builder: the fields of its class."""
     viewpoints: dict[str, Viewpoint]
-    """Places to look from, by name; ``default`` is required."""
+    """Viewpoints by name; ``default`` is required."""
     description: str = ""
     """One line for ``rsbench list scenes``."""
     seed: int = 0
@@ -409,10 +409,10 @@ def load_scene(name_or_path: str | Path) -> Scene:
     """Build the scene of a card, in the scene frame. The same card gives the same arrays.
 
     Args:
-        name_or_path: a card that comes with rsbench, or a path that ends in ``.toml``.
+        name_or_path: name of a card that comes with rsbench, or a path that ends in ``.toml``.
 
     Raises:
-        RsbenchError: the card, its builder or a file that it names is missing or wrong, in one line.
+        RsbenchError: the card, its builder or a file that it names is missing or wrong; the message is one line.
     """
     path = card_path("scenes", name_or_path)
     card, builder = read_scene_card(path)
@@ -430,7 +430,7 @@ def load_scene(name_or_path: str | Path) -> Scene:
 
 
 def _built(builder: SceneBuilder, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-    """Meshes of a builder of ours, from the cache where they can be kept."""
+    """Return the meshes of one of our builders, from the cache if possible."""
     key = built_key(builder, seed)
     meshes = None if key is None else cached_meshes(key)
     if meshes is None:
@@ -441,10 +441,10 @@ def _built(builder: SceneBuilder, seed: int, folder: Path) -> tuple[SceneMesh, .
 
 
 def read_scene_card(path: Path) -> tuple[SceneCard, SceneBuilder]:
-    """Parse a scene card without building the scene: the card, and its builder with the card's parameters.
+    """Parse a scene card without building the scene; return it and its builder with the card's parameters.
 
     Raises:
-        RsbenchError: the card is wrong, in one line.
+        RsbenchError: the card is wrong; the message is one line.
     """
     card = parse_card(SceneCard, read_toml(path), str(path))
     cls = load_class(BUILDERS, card.builder, path)
@@ -452,7 +452,7 @@ def read_scene_card(path: Path) -> tuple[SceneCard, SceneBuilder]:
 
 
 def _check_meshes(meshes: tuple[SceneMesh, ...], where: str) -> None:
-    """Refuse what a renderer would stumble over, or read beyond its end."""
+    """Refuse invalid meshes, which could make a renderer fail or read beyond arrays."""
     if not meshes:
         raise RsbenchError(f"{where}: made no meshes")
     names: set[str] = set()

@@ -1,7 +1,7 @@
 """A scene from a mesh file of the user: glTF, GLB, OBJ, OFF, PLY or STL, read by trimesh.
 
-The model is scaled and placed, with ground below it and walls around it if wanted. Its surfaces are diffuse, or
-glossy with the roughness of a glTF.
+The model is scaled and placed, optionally with ground below it and walls around it. Its surfaces are diffuse, or
+glossy with the roughness in a glTF.
 """
 
 from __future__ import annotations
@@ -34,17 +34,16 @@ from rsbench.storage.untrusted_files import check_amount, check_size
 
 _GROUND, _WALL = "cobbles", "brick"
 _SUNK = 1e-3
-"""Depth of the ground below the model, in sizes of the model, so that it does not coincide with the model's
-base."""
+"""Depth of the ground below the model, relative to the model's size, so that ground and base do not coincide."""
 _APART, _HIGH = 4.0, 2.0
-"""Distance from the model's axis to the walls, and their height, in sizes of the model."""
+"""Distance from the model's axis to the walls, and their height, relative to the model's size."""
 
 
 def standing(meshes: Sequence[SceneMesh], size: float | None) -> tuple[SceneMesh, ...]:
-    """The same model over the scene's origin, its lowest point at z = 0.
+    """Return the model centred above the scene's origin, with its lowest point at z = 0.
 
     Args:
-        meshes: of the model; all vertices that triangles use are within its box.
+        meshes: meshes of the model; only vertices of triangles count for its bounding box.
         size: length of the longest side of that box, metres; None keeps it.
     """
     low, high = box_of(meshes)
@@ -54,14 +53,14 @@ def standing(meshes: Sequence[SceneMesh], size: float | None) -> tuple[SceneMesh
 
 
 def box_of(meshes: Sequence[SceneMesh]) -> tuple[FloatArray, FloatArray]:
-    """Least and largest coordinates (3,) of the triangles of meshes."""
+    """Return the bounding box of the triangles of meshes: least and largest coordinates (3,)."""
     used = [mesh.vertices[np.unique(mesh.faces)] for mesh in meshes]
     lows, highs = [part.min(axis=0) for part in used], [part.max(axis=0) for part in used]
     return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
 def surroundings(meshes: Sequence[SceneMesh], ground: bool, backdrop: bool, seed: int) -> tuple[SceneMesh, ...]:
-    """Cobbles below a model, and a square of brick walls around it; its box decides their size."""
+    """Make cobbles below a model, and a square of brick walls around it, in proportion to its bounding box."""
     low, high = box_of(meshes)
     size, (x, y) = float(np.max(high - low)), (low[:2] + high[:2]) / 2
     floor, reach, pieces = float(low[2]) - _SUNK * size, _APART * size, list[Piece]()
@@ -80,7 +79,7 @@ def surroundings(meshes: Sequence[SceneMesh], ground: bool, backdrop: bool, seed
     return tuple(replace(mesh, name=f"around the model: {mesh.name}") for mesh in made)
 
 
-# Rows turn file axes into a right-handed frame with z up.
+# Rotations from the file's axes to a right-handed frame with z up.
 _Z_UP = {
     "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
@@ -89,7 +88,7 @@ _Z_UP = {
 _SHEET = 1024  # columns of the sheet that holds colours of faces
 _TRIANGLES = 1 << 22
 _TEXTURES = 1 << 26
-"""Pixels of all textures."""
+"""Largest number of pixels of all textures together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,26 +98,26 @@ class MeshBuilder(SceneBuilder):
     file: str
     """Path of the mesh file, relative to the card, or absolute."""
     metres_per_unit: float = 1.0
-    """Metres of one unit of the file; ``size`` replaces it."""
+    """Metres per unit of the file; ``size`` overrides it."""
     up_axis: Literal["x", "y", "z"] = "y"
     """The file's upward axis; glTF has y up."""
     heading_deg: float = 0.0
-    """Turns the model anticlockwise about the vertical."""
+    """Rotation of the model about the vertical, degrees anticlockwise."""
     shading: Literal["flat", "smooth"] = "flat"
     """Whether triangles are shaded flat or with the file's smooth normals."""
     transparent: Literal["refuse", "opaque"] = "refuse"
-    """Treatment of surfaces that the file cuts out or blends by an alpha: only opaque ones can be rendered."""
+    """Treatment of surfaces with an alpha mask or blending, since only opaque ones can be rendered."""
     gloss: Literal["none", "file"] = "none"
     """``file``: a clear coat with a glTF material's roughness, if that is 0.5 or less; ``none``: diffuse."""
 
     size: float | None = None
-    """Longest side of the model's box, metres, whatever its units are."""
+    """Longest side of the model's bounding box, metres, independent of the file's units."""
     place: Literal["file", "origin"] = "file"
-    """``origin`` sets the model over the scene's origin, its lowest point at z = 0."""
+    """``origin`` centres the model above the scene's origin, with its lowest point at z = 0."""
     ground: bool = False
-    """Cobbles below the model."""
+    """Whether there are cobbles below the model."""
     backdrop: bool = False
-    """Brick walls around it, four of its sizes away."""
+    """Whether there are brick walls around the model, at four times its size."""
 
     def __post_init__(self) -> None:
         for name in ("metres_per_unit", "size"):
@@ -129,18 +128,18 @@ class MeshBuilder(SceneBuilder):
             raise ValueError('size: needs place = "origin"; with place = "file" use metres_per_unit')
 
     def build(self, seed: int, folder: Path) -> tuple[SceneMesh, ...]:
-        """Meshes of a file in the scene frame, one for each part of its scene graph, textures and uv kept.
+        """Return the textured meshes of a file in the scene frame, one for each part of its scene graph.
 
         Args:
-            seed: of the textures of ground and walls.
-            folder: where a relative path starts.
+            seed: seed of the textures of ground and walls.
+            folder: folder to which the path of the file is relative.
 
         Raises:
-            RsbenchError: the file or one that it refers to is missing or broken, or holds no triangles.
+            RsbenchError: the file or one that it refers to is missing or invalid, or has no triangles.
         """
         path = folder / Path(self.file).expanduser()
         try:
-            with np.errstate(all="ignore"):  # what is not finite is refused by name
+            with np.errstate(all="ignore"):  # values that are not finite are refused later
                 meshes = self._meshes(path)
                 if np.array_equal(*box_of(meshes)):
                     raise RsbenchError(f"mesh file {path}: all of it lies in one point")
@@ -170,12 +169,12 @@ class MeshBuilder(SceneBuilder):
 
 
 class _Look(NamedTuple):
-    """What the parts of a file share, besides their geometry."""
+    """Data about appearance that the parts of a file share."""
 
     builder: MeshBuilder
     surfaces: dict[str, Surface]
     materials: dict[tuple[int, tuple[float, ...]], Material]
-    """Materials made so far, by the identity of trimesh's object and the colour that multiplies it."""
+    """Materials made so far, by the id of trimesh's object and the colour that multiplies it."""
 
 
 def _check_size(model: Any, path: Path) -> None:
@@ -196,7 +195,7 @@ def _scene_mesh(
         raise RsbenchError(f"{where} has vertices that are not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise RsbenchError(f"{where} has faces that name vertices beyond its {len(vertices)}")
-    # A mirror turns triangles over; shading normals stay on the side that the file has them.
+    # A reflection reverses the orientation of triangles; shading normals keep the side given in the file.
     faces = np.ascontiguousarray(faces[:, ::-1] if np.linalg.det(linear) < 0.0 else faces, dtype=np.int32)
     normals = _normals(part, linear, where) if look.builder.shading == "smooth" else None
     if part.visual.kind in ("vertex", "face"):
@@ -232,13 +231,13 @@ def _scene_mesh(
 
 
 def _image(source: Any) -> Any:
-    """The picture that colours a material of trimesh; None: none."""
+    """Return the colour texture of a trimesh material, or None."""
     pbr = isinstance(source, trimesh.visual.material.PBRMaterial)
     return source.baseColorTexture if pbr else getattr(source, "image", None)
 
 
 def _shades(part: Any, where: str) -> FloatArray:
-    """Linear reflectance (m, 3) by which the vertex colours of a glTF multiply each triangle; (1, 3) of none."""
+    """Return linear factors (m, 3) of the triangles from a glTF's vertex colours; ones (1, 3) without any."""
     colours = getattr(part.visual, "vertex_attributes", {}).get("color")
     if colours is None:
         return np.ones((1, 3))
@@ -249,7 +248,7 @@ def _shades(part: Any, where: str) -> FloatArray:
 
 
 def _normals(part: Any, linear: FloatArray, where: str) -> FloatArray:
-    """Unit normals (n, 3) of the vertices in the scene frame."""
+    """Return the unit normals (n, 3) of the vertices in the scene frame."""
     try:
         normals = np.asarray(part.vertex_normals, dtype=np.float64) @ np.linalg.inv(linear)
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
@@ -261,16 +260,16 @@ def _normals(part: Any, linear: FloatArray, where: str) -> FloatArray:
 
 
 def _unit(colours: NDArray[Any]) -> FloatArray:
-    """Colours between 0 and 1, from integers or floats."""
+    """Convert colours from integers or floats to floats between 0 and 1."""
     most = np.iinfo(colours.dtype).max if np.issubdtype(colours.dtype, np.integer) else 1.0
     return np.asarray(colours, dtype=np.float64) / most
 
 
 def _check_alpha(source: Any, part: Any, where: str, transparent: str) -> None:
-    """Refuse a material that is not opaque everywhere, unless alpha is to be ignored.
+    """Check that a material is opaque everywhere, unless ``transparent`` says to ignore alpha.
 
     Raises:
-        RsbenchError: see above.
+        RsbenchError: the material is transparent somewhere.
     """
     if transparent == "opaque" or source is None:
         return
@@ -296,7 +295,7 @@ def _check_alpha(source: Any, part: Any, where: str, transparent: str) -> None:
 def _material(
     source: Any, surface: Surface | None, shade: FloatArray, where: str, others: list[Material]
 ) -> Material:
-    """Diffuse part of a glTF or MTL material, multiplied by ``shade``; all else is ignored."""
+    """Return the diffuse part of a glTF or MTL material times ``shade``; other properties are ignored."""
     if source is None:
         return Material(name="plain")
     if isinstance(source, trimesh.visual.material.MultiMaterial):
@@ -306,7 +305,7 @@ def _material(
     if isinstance(source, trimesh.visual.material.PBRMaterial):
         linear = np.ones(3) if surface is None or surface.factor is None else surface.factor
     else:
-        # A texture is multiplied by Kd where the file has one, and Kd is sRGB as textures are.
+        # If the file has Kd, it multiplies the texture; Kd is sRGB like textures.
         stated = "kd" in getattr(source, "kwargs", {})
         diffuse = np.asarray(getattr(source, "diffuse", (204, 204, 204)), dtype=np.float64)[:3] / 255
         linear = srgb_to_linear(diffuse) if image is None or stated else np.ones(3)
@@ -319,11 +318,12 @@ def _material(
 
 
 def _roughness(source: Any, where: str) -> float | None:
-    """Roughness of a glTF material, at least that of the smoothest coat; None (diffuse) above the roughest, and
-    for other files.
+    """Return the roughness of a glTF material, at least ``SMOOTHEST``; None (diffuse) above ``ROUGHEST``.
+
+    The result is None for other files too.
 
     Raises:
-        RsbenchError: metal, or a roughness map: a coat has one roughness, on a diffuse surface.
+        RsbenchError: the material is metallic or has a roughness map, which a clear coat cannot represent.
     """
     if not isinstance(source, trimesh.visual.material.PBRMaterial):
         return None
@@ -344,7 +344,7 @@ def _roughness(source: Any, where: str) -> float | None:
 
 
 def _texture(image: Any, factor: FloatArray, where: str, others: list[Material]) -> NDArray[np.uint8]:
-    """(h, w, 3) sRGB of an image times a linear factor; its size is checked before it is decoded."""
+    """Return the sRGB texture (h, w, 3) of an image times a linear factor, after checking the image's size."""
     check_size(f"{where}: texture", image.size, most=TEXTURE)
     taken = sum(other.texture.size // 3 for other in others if other.texture is not None)
     pixels = taken + image.size[0] * image.size[1]
@@ -365,13 +365,13 @@ def _coloured_faces(
     normals: FloatArray | None,
     colours: NDArray[np.uint8],
 ) -> SceneMesh:
-    """A mesh with a colour for each face, from a texture with one texel for each colour."""
+    """Make a mesh with one colour per face, using a texture with one texel per colour."""
     palette, index = np.unique(colours, axis=0, return_inverse=True)
     index = np.asarray(index).ravel()
     rows = -(-len(palette) // _SHEET)
     sheet = np.zeros((rows * _SHEET, 3), dtype=np.uint8)
     sheet[: len(palette)] = palette
-    # The centre of a texel, where bilinear interpolation gives its colour alone; v points up from the last row.
+    # At the centre of a texel, bilinear interpolation gives exactly its colour; v points up from the last row.
     centre = np.stack([(index % _SHEET + 0.5) / _SHEET, 1 - (index // _SHEET + 0.5) / rows], axis=1)
     return SceneMesh(
         name=name,

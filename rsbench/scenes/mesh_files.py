@@ -1,9 +1,9 @@
-"""Mesh files of a user as trimesh reads them, and what it leaves out.
+"""Reads mesh files with trimesh, and adds features that trimesh ignores.
 
-A file may name others, such as textures, in its own folder and below. The size that a file states is checked
-before trimesh reads it. Trimesh leaves out, and this module reads: transforms and wraps of the textures of a glTF,
-exact factors of its colours, its triangle fans (refused), options of ``map_Kd`` of an MTL, and in an OBJ numbers
-that count back from where they stand, and the shape of polygons that are not convex.
+A file may refer to others, such as textures, in its own folder and below. The sizes stated in a file are checked
+before trimesh reads it. This module handles what trimesh ignores: in glTF, transforms and wrap modes of textures,
+exact colour factors and triangle fans (refused); in MTL, options of ``map_Kd``; in OBJ, negative indices, which
+are relative to the current line, and non-convex polygons.
 """
 
 from __future__ import annotations
@@ -35,29 +35,31 @@ from rsbench.storage.untrusted_files import (
     read_bytes,
 )
 
-logging.getLogger("trimesh").addHandler(logging.NullHandler())  # what it logs of a file is in our line
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # our errors contain what it logs
 Wrap = Literal["repeat", "mirror", "clamp"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
-    """What a file says of the colour of a material and trimesh leaves out."""
+    """Properties of a material's colour that trimesh ignores."""
 
     name: str
     linear: FloatArray
-    """(2, 2) and"""
+    """(2, 2) linear part of the texture transform, see ``offset``."""
     offset: FloatArray
-    """(2,) of the texture's coordinates: ``linear @ uv + offset`` of those of the mesh, v up in both."""
+    """(2,) offset of the texture transform: texture coordinates are ``linear @ uv + offset``, v up in both."""
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
-    """Beyond 0 to 1, along u and along v."""
+    """Wrap mode outside of [0, 1], along u and along v."""
     factor: FloatArray | None = None
-    """(3,) linear reflectance that multiplies texture and vertex colours; None: as trimesh has it."""
+    """(3,) linear reflectance that multiplies texture and vertex colours; None: use trimesh's value."""
 
     def coordinates(self, uv: FloatArray, size: tuple[int, int], where: str) -> FloatArray:
-        """Coordinates (n, 2) in ``wrapped`` of coordinates of the mesh, v up; ``size``: of the texture, w and h.
+        """Convert mesh coordinates (n, 2), v up, to coordinates in the texture returned by ``wrapped``.
+
+        ``size`` is the width and height of the original texture.
 
         Raises:
-            RsbenchError: the texture is clamped, and coordinates lead out of it.
+            RsbenchError: the texture is clamped, and coordinates are outside of it.
         """
         found = uv @ self.linear.T + self.offset
         for axis, (wrap, texels) in enumerate(zip(self.wrap, size, strict=True)):
@@ -73,7 +75,7 @@ class Surface:
         return found
 
     def wrapped(self, texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A texture (h, w, 3) that, repeated, continues as this one does: mirrored, or with its border doubled."""
+        """Return a texture (h, w, 3) to be repeated that emulates ``wrap``: with its mirror image or a border."""
         for axis, wrap in ((1, self.wrap[0]), (0, self.wrap[1])):
             if wrap == "mirror":
                 pair = (texture, np.flip(texture, axis))
@@ -87,15 +89,15 @@ class Surface:
 
 _TRANSFORM = "KHR_texture_transform"
 _HARMLESS = (_TRANSFORM, "KHR_materials_", "KHR_lights_", "EXT_texture_webp")
-"""Beginnings of extensions that may be required: we read them, or they say what a diffuse surface has not."""
+"""Prefixes of extensions that a file may require: we read them, or they do not affect diffuse surfaces."""
 _ARCHIVED = "KHR_materials_pbrSpecularGlossiness"
 
 
 def check_extensions(header: Mapping[str, Any], where: str) -> None:
-    """Refuse what would be read as something else than it is.
+    """Refuse glTF files that would be misread.
 
     Raises:
-        RsbenchError: the file requires an extension that is not read, or has materials of an old one.
+        RsbenchError: the file requires an unsupported extension, or has materials of an archived one.
     """
     for name in header.get("extensionsRequired", []):
         if not str(name).startswith(_HARMLESS) or name == _ARCHIVED:
@@ -105,13 +107,12 @@ def check_extensions(header: Mapping[str, Any], where: str) -> None:
 
 
 def _surfaces(header: Mapping[str, Any], where: str) -> dict[str, Surface]:
-    """Surfaces by the numbers of their materials, which ``_numbered`` makes their names.
+    """Return surfaces by material number, which ``_numbered`` sets as the material's name.
 
-    The transform is that of KHR_texture_transform: scaled, then turned, anticlockwise as one sees it in a picture
-    of u and v, then moved, with v down.
+    The transform is that of KHR_texture_transform, with v down: scale, then rotation, then offset.
 
     Raises:
-        RsbenchError: a texture uses other coordinates than the first.
+        RsbenchError: a texture uses another set of coordinates than the first.
     """
     found = {}
     for number, material in enumerate(header.get("materials", [])):
@@ -138,9 +139,9 @@ def _surfaces(header: Mapping[str, Any], where: str) -> dict[str, Surface]:
 
 
 def _numbered(header: dict[str, Any]) -> dict[str, Any]:
-    """A header whose materials are named by their numbers, and where vertex colours always have a material.
+    """Return a header with numbered material names, and with a material for each primitive with vertex colours.
 
-    Trimesh makes bytes of the vertex colours of a primitive without one, too coarse for linear light.
+    Without a material, trimesh converts vertex colours to 8 bits, which is too coarse for linear light.
     """
     materials = [each | {"name": str(number)} for number, each in enumerate(header.get("materials", []))]
     bare = False
@@ -159,13 +160,13 @@ def _pair(values: Any) -> tuple[float, float]:
 
 
 PARTS = 1 << 12
-"""Nodes, meshes, materials and so on, of each kind."""
+"""Largest number of nodes, meshes, materials and so on, each."""
 VALUES = 1 << 26
-"""Numbers in the arrays of a file, and in those of all its parts, which may share them."""
+"""Largest number of values in the arrays of a file, and in those of all its parts, which may share arrays."""
 _DEEPEST = 64
 _VISITS = 1 << 28
 TEXTURE = 1 << 24
-"""Pixels of a texture, 4096 x 4096."""
+"""Largest number of pixels of a texture, 4096 x 4096."""
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 _FAN = 6
@@ -173,14 +174,14 @@ _TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "M
 
 
 def check_mesh_file(path: Path) -> tuple[bytes | None, dict[str, Surface]]:
-    """Refuse a mesh file that says of itself that it unfolds to too much, or would be read as something else.
+    """Refuse a mesh file that is too large when expanded, or that trimesh would misread.
 
     Returns:
-        What trimesh should read in place of the file, None: the file itself; and surfaces by the names that its
-        materials have there.
+        The content that trimesh should read instead of the file (None: the file itself), and the surfaces by
+        material name in that content.
 
     Raises:
-        RsbenchError: that, a format that is not read, or a header that cannot be one.
+        RsbenchError: the file is refused, its format is unsupported, or its header is invalid.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -210,7 +211,7 @@ def check_mesh_file(path: Path) -> tuple[bytes | None, dict[str, Surface]]:
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes]:
-    """The JSON of a binary glTF, and the rest: the binary chunk after eight bytes, which begin with its size."""
+    """Split a binary glTF into its JSON and the rest: the binary chunk with its header of eight bytes."""
     if data[:4] != b"glTF" or data[16:20] != b"JSON":
         raise ValueError("not binary glTF")
     end = 20 + int.from_bytes(data[12:16], "little")
@@ -218,7 +219,7 @@ def _chunks(data: bytes) -> tuple[bytes, bytes]:
 
 
 def _binary_gltf(start: bytes, text: bytes, rest: bytes) -> bytes:
-    """A binary glTF of its magic and version, its JSON and the chunks after that."""
+    """Assemble a binary glTF from its magic and version, its JSON and the remaining chunks."""
     text += b" " * (-len(text) % 4)
     size = (20 + len(text) + len(rest)).to_bytes(4, "little")
     return start + size + len(text).to_bytes(4, "little") + b"JSON" + text + rest
@@ -245,7 +246,7 @@ def _check_gltf(header: dict[str, Any], where: str, binary: bytes) -> None:
 
 
 def _coloured_images(header: dict[str, Any]) -> list[int]:
-    """Numbers of the images that colour a material, each once."""
+    """Return the distinct numbers of the images that are colour textures of materials."""
     textures = [
         each.get("pbrMetallicRoughness", {}).get("baseColorTexture") for each in header.get("materials", [])
     ]
@@ -254,9 +255,9 @@ def _coloured_images(header: dict[str, Any]) -> list[int]:
 
 
 def _check_image(header: dict[str, Any], number: int, binary: bytes, where: str) -> None:
-    """Refuse an image inside the file that cannot be decoded, in whose place trimesh takes grey without a word.
+    """Refuse an embedded image that cannot be decoded; trimesh would silently replace it by grey.
 
-    Images in files of their own are read, and refused, as they are needed.
+    Images in separate files are checked when they are read.
     """
     image = header["images"][number]
     if str(image.get("uri", "")).startswith("data:"):
@@ -272,7 +273,7 @@ def _check_image(header: dict[str, Any], number: int, binary: bytes, where: str)
 
 
 def _check_graph(header: dict[str, Any], where: str) -> None:
-    """Refuse nodes that are not trees, as glTF requires, or so deep that each path takes long."""
+    """Refuse nodes that do not form trees, as glTF requires, or trees that are too deep."""
     children = [node.get("children", []) for node in header.get("nodes", [])]
     parents = {child: number for number, each in enumerate(children) for child in each}
     shown = [node for scene in header.get("scenes", []) for node in scene.get("nodes", [])]
@@ -303,7 +304,7 @@ def _accessors(primitive: dict[str, Any]) -> Iterable[int]:
 def _check_obj(data: bytes, where: str) -> None:
     groups = len(re.findall(rb"^\s*(?:usemtl|o|g)\s", data, re.MULTILINE))
     check_amount(where, "groups", groups, PARTS)
-    # Its reader goes through all vertices for each group.
+    # Trimesh's OBJ reader processes all vertices for each group.
     vertices = len(re.findall(rb"^\s*v\s", data, re.MULTILINE))
     check_amount(where, "vertices times groups", vertices * groups, _VISITS)
 
@@ -311,7 +312,7 @@ def _check_obj(data: bytes, where: str) -> None:
 def _check_ply(data: bytes, where: str) -> None:
     header, _, content = data.partition(b"end_header")
     counts = [int(count) for count in re.findall(rb"^element\s+\S+\s+(\S+)", header, re.MULTILINE)]
-    # Each vertex and each face takes a byte at least; of text, each line is one.
+    # Each vertex and each face takes at least one byte, and in text, one line.
     if min(counts, default=0) < 0 or sum(counts) > len(content):
         raise ValueError(f"states {sum(counts)} elements in {len(content)} bytes")
     if b"ascii" in header and content.count(b"\n") > 2 * sum(counts) + PARTS:
@@ -319,13 +320,13 @@ def _check_ply(data: bytes, where: str) -> None:
 
 
 class _Neighbours(trimesh.resolvers.FilePathResolver):
-    """Files beside the model and below, as UTF-8; remembers what was wrong with them, which trimesh only logs."""
+    """Resolves files in the model's folder and below, as UTF-8; records their errors, which trimesh only logs."""
 
     def __init__(self, source: str) -> None:
         super().__init__(source)
         self.wrong: list[str] = []
         self.materials: dict[str, Surface] = {}
-        """Those of the MTL files that were read."""
+        """Surfaces of the MTL files that were read, by material name."""
 
     def get(self, name: str) -> bytes:
         try:
@@ -344,7 +345,7 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):
         return content
 
     def _written(self, name: str) -> str:
-        """The name of a file: exporters on Windows write paths of theirs, and glTF encodes blanks as URIs do."""
+        """Normalise a file name: Windows exporters write backslashes, and glTF encodes names as URIs."""
         name = name.replace("\\", "/")
         return name if self.absolute(name).exists() else unquote(name)
 
@@ -358,7 +359,7 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):
 
 
 def _as_utf8(text: bytes) -> bytes:
-    """Text of unknown encoding: UTF-8 when it can be, else the old one of Western exporters."""
+    """Convert text of unknown encoding, UTF-8 if it is valid, else Latin-1, to UTF-8."""
     try:
         return text.decode("utf-8-sig").encode("utf-8")
     except UnicodeDecodeError:
@@ -366,10 +367,12 @@ def _as_utf8(text: bytes) -> bytes:
 
 
 def read_mesh_file(path: Path) -> tuple[Any, dict[str, Surface]]:
-    """What trimesh makes of a file, and the surfaces by the names of their materials.
+    """Read a mesh file; return trimesh's scene and the surfaces by material name.
+
+    Errors of trimesh are not converted.
 
     Raises:
-        RsbenchError: the file or one that it refers to is missing or wrong; errors of trimesh pass.
+        RsbenchError: the file or one that it refers to is missing or wrong.
     """
     if not path.is_file():
         raise RsbenchError(f"mesh file {path}: no such file (parameters.file is relative to the card)")
@@ -390,7 +393,7 @@ def read_mesh_file(path: Path) -> tuple[Any, dict[str, Surface]]:
 
 
 def _check_names(text: bytes, known: Mapping[str, Surface], path: Path) -> None:
-    """Refuse materials that no library has, where trimesh takes grey instead; an OBJ without any is grey."""
+    """Refuse material names that no MTL file defines; trimesh would silently use grey."""
     used = re.findall(rb"^\s*usemtl[ \t]+(.+?)\s*$", text, re.MULTILINE)
     missing = sorted({name.decode() for name in used} - set(known))
     if missing:
@@ -398,13 +401,13 @@ def _check_names(text: bytes, known: Mapping[str, Surface], path: Path) -> None:
 
 
 _OPTIONS = {"-s": 3, "-o": 3, "-t": 3, "-mm": 2}
-"""Most numbers after an option of ``map_Kd``; the others have one word."""
+"""Largest number of values after an option of ``map_Kd``; other options have one."""
 
 
 def _library(text: bytes, where: str) -> tuple[bytes, dict[str, Surface]]:
-    """An MTL file without the options of its textures, and its surfaces by name.
+    """Return an MTL file without the options of its textures, and its surfaces by name.
 
-    ``-s`` scales coordinates, ``-o`` moves them, ``-clamp on`` ends the texture at its border.
+    ``-s`` scales coordinates, ``-o`` is their offset, ``-clamp on`` clamps the texture to its border.
 
     Raises:
         RsbenchError: an option changes the colours of a texture.
@@ -437,7 +440,7 @@ def _library(text: bytes, where: str) -> tuple[bytes, dict[str, Surface]]:
 
 
 def _map_options(value: Sequence[str]) -> tuple[dict[str, list[str]], str]:
-    """Options of a texture, and the name of its file, which may have blanks."""
+    """Parse the options of a texture and the name of its file, which may contain blanks."""
     options, rest = dict[str, list[str]](), value[0].strip() if value else ""
     while rest.startswith("-") and len(words := rest.split()) > 2:
         count = 1
@@ -449,9 +452,9 @@ def _map_options(value: Sequence[str]) -> tuple[dict[str, list[str]], str]:
 
 
 def _plain_polygons(text: bytes) -> bytes:
-    """An OBJ whose faces have numbers from 1, and whose polygons that are not convex are cut into triangles.
+    """Return an OBJ with positive face indices and with non-convex polygons cut into triangles.
 
-    Trimesh counts negative numbers back from the end of the file, and makes fans of all polygons.
+    Trimesh interprets negative indices relative to the end of the file, and splits all polygons into fans.
     """
     lines, counts = text.split(b"\n"), {b"v": 0, b"vt": 0, b"vn": 0}
     vertices, polygons = list[list[bytes]](), dict[int, list[tuple[int, list[int]]]]()
@@ -484,13 +487,13 @@ def _plain_polygons(text: bytes) -> bytes:
 
 
 def _from_one(word: bytes, counts: Mapping[bytes, int]) -> bytes:
-    """A corner ``v/vt/vn`` of a face whose negative numbers count back from the last one so far."""
+    """Convert the negative indices of a corner ``v/vt/vn``, relative to the current counts, to positive ones."""
     kinds = zip(word.split(b"/"), counts.values(), strict=False)
     return b"/".join(b"%d" % (count + 1 + int(n)) if n.startswith(b"-") else n for n, count in kinds)
 
 
 def _cut(polygon: FloatArray, normal: FloatArray) -> NDArray[np.intp]:
-    """Triangles (m, 3) of a polygon (n, 3), turning as it does about its normal (3,)."""
+    """Triangulate a polygon (n, 3) to (m, 3) corner indices, with its orientation about the normal (3,)."""
     kept = np.delete(np.arange(3), np.argmax(np.abs(normal)))
     flat = np.ascontiguousarray(polygon[:, kept] - polygon[0, kept])
     found = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], dtype=np.uint32)).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""What a scene is: textured meshes, a sun, a sky and the places to look from.
+"""The parts of a scene: textured meshes, sun, sky and viewpoints.
 
 A scene builder returns meshes in the *scene frame*: right-handed, z up, metres, ground near z = 0.
 ``Scene.seen_from`` moves it into the *world frame* of the conventions (x right, y down, z forward, the rig's
@@ -21,28 +21,28 @@ from rsbench.core.errors import RsbenchError
 
 FloatArray = NDArray[np.float64]
 SMOOTHEST, ROUGHEST = 0.05, 0.5
-"""Least and largest roughness of glossy surfaces. A smoother surface mirrors the sun as a point that pixels cannot
-show; above 0.5 the model, which has no interreflection between facets, loses more light than it mirrors: such
+"""Least and largest roughness of glossy surfaces. The sun's reflection on a smoother surface is too small for
+pixels. Above 0.5 the model, which has no interreflection between facets, loses more light than it reflects: such
 surfaces are diffuse."""
 _UNIT = 1e-6
-"""Quaternions may be longer or shorter than 1 by this much: rounding in a file."""
+"""Tolerance of the norm of quaternions, for rounding in files."""
 
 
 def srgb_to_linear(srgb: ArrayLike) -> FloatArray:
-    """Linear intensity of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    """Convert sRGB values in [0, 1] to linear intensity (IEC 61966-2-1)."""
     values = np.asarray(srgb, dtype=np.float64)
     return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(linear: NDArray[Any]) -> NDArray[Any]:
-    """The inverse of ``srgb_to_linear``; values keep their type."""
+    """Convert linear intensity to sRGB, the inverse of ``srgb_to_linear``; values keep their type."""
     curve = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
     return np.asarray(np.where(linear <= 0.0031308, 12.92 * linear, curve))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """A diffuse surface, visible from both sides; glossy where it has a ``roughness``.
+    """A surface that is visible from both sides: diffuse, or glossy if it has a ``roughness``.
 
     Raises:
         RsbenchError: ``roughness`` is out of its range.
@@ -50,12 +50,12 @@ class Material:
 
     name: str
     colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
-    """sRGB reflectance in [0, 1]; multiplies nothing when ``texture`` is given."""
+    """sRGB reflectance in [0, 1]; ignored if there is a ``texture``."""
     texture: NDArray[np.uint8] | None = None
     """(h, w, 3) sRGB, repeated in both directions; row 0 is the top, uv v points up."""
     roughness: float | None = None
-    """None: diffuse. Else in [0.05, 0.5], as of glTF: below a clear coat of refractive index 1.5, whose facets are
-    spread by the law of Trowbridge and Reitz (GGX) with alpha = roughness squared."""
+    """None for diffuse surfaces, else glTF's roughness in [0.05, 0.5]: that of a clear coat of refractive index
+    1.5 with a Trowbridge-Reitz (GGX) distribution of microfacets, alpha = roughness squared."""
 
     def __post_init__(self) -> None:
         if self.roughness is not None and not SMOOTHEST <= self.roughness <= ROUGHEST:
@@ -80,7 +80,7 @@ class SceneMesh:
     normals: FloatArray | None = None
     """(n, 3) unit shading normals; absent = flat shading."""
     mover: int = 0
-    """Number from 1 of the object that it belongs to, which moves by itself; 0: it stands still."""
+    """Number, from 1, of the moving object to which the mesh belongs; 0 for static meshes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,10 +88,9 @@ class Environment:
     """Light from all directions, instead of a two-colour sky."""
 
     radiance: NDArray[np.float32]
-    """(H + 1, 2 H, 3) linear RGB: columns go around as in a picture of all that is, rows from zenith to nadir, the
-    first and the last being these."""
+    """(H + 1, 2 H, 3) linear RGB of a lat-long map; the first row is the zenith, the last the nadir."""
     frame_from_map: FloatArray
-    """(3, 3) rotation from the map's axes: x right, y down, z forward to the middle of the map."""
+    """(3, 3) rotation from the map's axes: x right, y down, z forward to the centre of the map."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,11 +105,11 @@ class Light:
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit vector to the zenith, in the frame of the scene."""
     environment: Environment | None = field(default=None, repr=False)
-    """Instead of the sky, where there is one; the sun is not in it."""
+    """Environment map without the sun, which replaces the sky colours if given."""
 
     @property
     def mean_sky(self) -> FloatArray:
-        """Cosine-weighted mean radiance (3,) of the sky over the upper hemisphere: E / pi of level ground.
+        """Cosine-weighted mean radiance (3,) of the sky over the upper hemisphere: E / pi on level ground.
 
         The integral of (horizon + (zenith - horizon) cos) cos over it is pi horizon / 3 + 2 pi zenith / 3.
         """
@@ -119,15 +118,15 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class Viewpoint:
-    """Where the rig's body stands at time 0: at ``eye``, looking at ``target``, the horizon level."""
+    """Pose of the rig's body at time 0: at ``eye``, looking at ``target``, with a level horizon."""
 
     eye: tuple[float, float, float]
     """Position of the rig's body at time 0, in the scene frame (z up), metres."""
     target: tuple[float, float, float]
-    """Point at which it looks, in the scene frame, metres."""
+    """Point at which the body looks, in the scene frame, metres."""
 
     def world_from_scene(self) -> tuple[FloatArray, FloatArray]:
-        """Rotation (3, 3) and translation (3,) with ``X_world = R @ X_scene + t``.
+        """Return rotation (3, 3) and translation (3,) with ``X_world = R @ X_scene + t``.
 
         Raises:
             RsbenchError: the view is vertical or ``eye`` equals ``target``, so the horizon is undefined.
@@ -145,39 +144,39 @@ class Viewpoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """Where the rig's body stands at time 0, where a trajectory and not a viewpoint says so."""
+    """Pose of the rig's body at time 0 on a trajectory, relative to a viewpoint."""
 
     position: tuple[float, float, float]
-    """Metres, in the frame of the viewpoint: x right, y down, z forward from its eye."""
+    """Position in the frame of the viewpoint, metres: x right, y down, z forward from its eye."""
     quaternion: tuple[float, float, float, float]
-    """(w, x, y, z): turns the body's axes into those of that frame."""
+    """Rotation (w, x, y, z) from the body's axes to that frame."""
     absolute: bool = False
-    """The frame is the scene's own instead."""
+    """Whether the pose is relative to the scene frame instead of the viewpoint."""
 
     def __post_init__(self) -> None:
         if abs(float(np.linalg.norm(self.quaternion)) - 1.0) > _UNIT:
             raise ValueError(f"quaternion = {self.quaternion}: must be of length 1")
 
     def world_from_scene(self, viewpoint: Viewpoint) -> tuple[FloatArray, FloatArray]:
-        """Rotation (3, 3) and translation (3,), as in ``Viewpoint``."""
+        """Return rotation (3, 3) and translation (3,), as in ``Viewpoint``."""
         turn, position = so3.from_quaternion(self.quaternion).T, np.asarray(self.position)
         R, t = (np.eye(3), np.zeros(3)) if self.absolute else viewpoint.world_from_scene()
         return turn @ R, turn @ (t - position)
 
 
 class SceneBuilder(ABC):
-    """Makes the meshes of a scene. A frozen dataclass: its fields are the parameters that a scene card may set."""
+    """Builds the meshes of a scene. Subclasses are frozen dataclasses whose fields a scene card may set."""
 
     closed: ClassVar[bool] = False
-    """Whether parameters and seed alone decide the meshes, so that they can be cached; of our builders only."""
+    """Whether the meshes depend only on parameters and seed and can be cached; used for our builders only."""
 
     @abstractmethod
     def build(self, seed: int, folder: Path) -> Sequence[SceneMesh]:
-        """Meshes in the scene frame: right-handed, z up, metres, ground near z = 0.
+        """Return meshes in the scene frame: right-handed, z up, metres, ground near z = 0.
 
         Args:
-            seed: of the card; the same seed gives the same arrays.
-            folder: of the card, where relative paths in parameters start.
+            seed: seed of the card; the same seed gives the same arrays.
+            folder: folder of the card, to which paths in parameters are relative.
         """
 
 
@@ -192,11 +191,11 @@ class Scene:
 
     @property
     def glossy(self) -> bool:
-        """Whether any surface is."""
+        """Whether any surface is glossy."""
         return any(mesh.material.roughness is not None for mesh in self.meshes if mesh.faces.size)
 
     def seen_from(self, viewpoint: Viewpoint, start: Start | None = None) -> Scene:
-        """The same scene in the world frame whose origin and axes are the body at time 0."""
+        """Return the scene in the world frame, whose origin and axes are those of the body at time 0."""
         placed = viewpoint.world_from_scene() if start is None else start.world_from_scene(viewpoint)
         rotation, translation = placed
         meshes = tuple(

@@ -1,4 +1,4 @@
-"""Objects of a scene that move by themselves: one of its meshes, or a mesh file or a textured box put into it."""
+"""Moving objects of a scene: one of its meshes, or an added mesh file or textured box."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rsbench.scenes.model import FloatArray, Material, Scene, SceneMesh
 from rsbench.scenes.surfaces import fractal_noise, to_bytes
 
 MOST_MOVING = 64
-"""Objects of a sequence."""
+"""Largest number of moving objects of a sequence."""
 _PIXELS = 256
 Vector = tuple[float, float, float]
 _WORLD_FROM_SCENE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Turns axes x right, y forward, z up into x right, y down, z forward."""
+"""Rotation from axes x right, y forward, z up to x right, y down, z forward."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,18 +29,17 @@ class MeshFile:
     """A mesh file of the user, see ``scenes.mesh.MeshBuilder``."""
 
     file: str
-    """Path of the mesh file, relative to the dataset's card, or absolute; in a sequence.json the name alone."""
+    """Path of the mesh file, absolute or relative to the dataset's card; in a sequence.json only its name."""
     size: float | None = None
-    """Longest edge of its box, metres; absent, as the file has it, times ``metres_per_unit``."""
+    """Longest edge of its bounding box, metres; by default that in the file times ``metres_per_unit``."""
     metres_per_unit: float = 1.0
-    """Metres of one unit of the file."""
+    """Metres per unit of the file."""
     up_axis: Literal["x", "y", "z"] = "y"
     """The file's upward axis; glTF has y up."""
     shading: Literal["flat", "smooth"] = "flat"
     """Whether triangles are shaded flat or with the file's smooth normals."""
     transparent: Literal["refuse", "opaque"] = "refuse"
-    """What becomes of surfaces that are cut out or blended by an alpha: the file is refused, or they are rendered
-    opaque."""
+    """Treatment of surfaces with an alpha mask or blending: refuse the file, or render them opaque."""
 
     def __post_init__(self) -> None:
         if not Path(self.file).name:
@@ -56,12 +55,12 @@ class MeshFile:
         return Path(self.file).name
 
     def meshes(self) -> tuple[SceneMesh, ...]:
-        """Its parts, in a frame with z up whose origin is the middle of their box.
+        """Return the parts in a frame with z up whose origin is the centre of their bounding box.
 
         Raises:
             RsbenchError: see ``MeshBuilder.build``.
         """
-        from rsbench.scenes.mesh import MeshBuilder, box_of  # which load trimesh
+        from rsbench.scenes.mesh import MeshBuilder, box_of  # imported here because it loads trimesh
 
         made = MeshBuilder(**asdict(self), place="origin").build(0, Path())
         middle = np.mean(box_of(made), axis=0)
@@ -70,19 +69,19 @@ class MeshFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """A rigid thing that moves."""
+    """A rigid moving object."""
 
     position: Vector
-    """The point about which the object turns, the middle of the box or of the box around a mesh: in the world
-    frame at time 0 (x right, y down, z forward), metres."""
+    """Centre of rotation, and centre of the box or of the bounding box of a mesh file: in the world frame at time
+    0 (x right, y down, z forward), metres."""
     instance: str = ""
-    """Name of a mesh of the scene that moves; give this, ``box`` or ``mesh``."""
+    """Name of a mesh of the scene that moves; exactly one of this, ``box`` and ``mesh`` is needed."""
     box: Vector | None = None
-    """Edges along x, y, z of a textured box that moves, metres."""
+    """Edge lengths along x, y, z of a moving textured box, metres."""
     mesh: MeshFile | None = None
-    """Mesh file of an object that moves: upright, its x to the right."""
+    """Mesh file of a moving object, which is upright with its x axis to the right if ``attitude_deg`` is zero."""
     attitude_deg: Vector = (0.0, 0.0, 0.0)
-    """Rotation vector by which the box, or the mesh of a file, is turned at time 0."""
+    """Rotation vector of the attitude of the box or mesh file at time 0, degrees."""
     texture_seed: int = 0
     """Seed of the texture of the box."""
 
@@ -102,10 +101,10 @@ class Body:
 
 
 def with_moving(scene: Scene, bodies: Sequence[Body]) -> Scene:
-    """A scene in the world frame at time 0 whose meshes know to which body they belong.
+    """Add the bodies to a scene in the world frame at time 0, and set ``mover`` of their meshes.
 
     Raises:
-        RsbenchError: a mesh that the scene does not have, or that moves twice; a mesh file that cannot be read.
+        RsbenchError: the scene has no mesh of this name, a mesh moves twice, or a mesh file cannot be read.
     """
     meshes = list(scene.meshes)
     for number, body in enumerate(bodies, start=1):
@@ -127,7 +126,7 @@ def with_moving(scene: Scene, bodies: Sequence[Body]) -> Scene:
 
 
 def _placed(meshes: Sequence[SceneMesh], body: Body, number: int) -> list[SceneMesh]:
-    """Meshes of a frame with z up, whose origin comes to the position of a body."""
+    """Transform meshes from a frame with z up to the world frame, with their origin at the body's position."""
     turn = so3.exp(np.deg2rad(body.attitude_deg)) @ _WORLD_FROM_SCENE
     return [
         replace(
@@ -142,7 +141,7 @@ def _placed(meshes: Sequence[SceneMesh], body: Body, number: int) -> list[SceneM
 
 
 def _box(body: Body, edges: Vector, number: int) -> SceneMesh:
-    """Six sides, each with a part of one texture of its own; the longest edge is half a repeat."""
+    """Make a box whose sides show different parts of one texture; its longest edge covers half a repeat."""
     corners, uv, faces = list[FloatArray](), list[FloatArray](), list[list[int]]()
     for side, (axis, sign) in enumerate((axis, sign) for axis in range(3) for sign in (-1.0, 1.0)):
         u, v = (axis + 1) % 3, (axis + 2) % 3

@@ -98,7 +98,7 @@ def _row(
     widths: list[float],
     first: int,
 ) -> list[Piece]:
-    """Houses wall to wall; ``start`` is the left end of the front as who looks at it sees it."""
+    """Make adjoining houses; ``start`` is the left end of the front, seen from the street."""
     pieces: list[Piece] = []
     along = np.array([np.cos(np.deg2rad(heading)), np.sin(np.deg2rad(heading))])
     position = np.asarray(start, dtype=np.float64)

@@ -211,7 +211,7 @@ def _wrapped(position: Field, size: int) -> Field:
 
 
 def _lookup(cuts: Sequence[Field], pixels: int) -> NDArray[np.intp]:
-    """Number of the interval, counted through all lists of cuts, at quarter pixels: (lists, 4 pixels + 1)."""
+    """Return the interval number, counted over all lists of cuts, at quarter pixels: (lists, 4 pixels + 1)."""
     positions = np.arange(_FINENESS * pixels + 1) / _FINENESS
     first = np.cumsum([0, *(len(cut) - 1 for cut in cuts[:-1])])
     inside = [np.searchsorted(cut[1:-1], positions, side="right") for cut in cuts]

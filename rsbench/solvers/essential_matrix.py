@@ -1,5 +1,5 @@
-"""Essential matrices of the left camera: the normalised eight-point algorithm, which the paper compares with, and
-OpenCV's five points, which most people would call.
+"""Essential matrices of the left camera: the normalised eight-point algorithm, with which the paper compares, and
+OpenCV's five-point algorithm, which is the most widely used.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ DEGENERATE = "the matches fit more than one essential matrix: degenerate scene o
 
 
 def rays_of(matches: FloatArray, rig: StereoRig) -> tuple[FloatArray, FloatArray]:
-    """Rays (n, 3), z = 1, of both ends of matches (n, 4) of one camera."""
+    """Return rays (n, 3), z = 1, of both ends of matches (n, 4) of one camera."""
     return rig.camera.unproject(matches[:, :2]), rig.camera.unproject(matches[:, 2:])
 
 
 def normalising_transform(x: FloatArray) -> FloatArray:
-    """Similarity (3, 3) that centres points (n, 2) and gives them a mean distance of sqrt(2)."""
+    """Return the similarity (3, 3) that centres points (n, 2) and scales their mean distance to sqrt(2)."""
     centre = np.mean(x, axis=0)
     distance = float(np.mean(np.linalg.norm(x - centre, axis=1)))
     scale = np.sqrt(2.0) / distance if distance > 0.0 else 1.0
@@ -37,7 +37,7 @@ def normalising_transform(x: FloatArray) -> FloatArray:
 
 
 def eight_point(x0: FloatArray, x1: FloatArray) -> FloatArray | None:
-    """Essential matrix (3, 3) with ``x1^T E x0 = 0`` of rays (n, 3) with z = 1; None when they are degenerate.
+    """Return the matrix E (3, 3) with ``x1^T E x0 = 0`` for rays (n, 3) with z = 1; None for degenerate rays.
 
     Hartley, In Defense of the Eight-Point Algorithm, PAMI 1997.
     """
@@ -48,13 +48,17 @@ def eight_point(x0: FloatArray, x1: FloatArray) -> FloatArray | None:
 
 
 def null_essential(rows: FloatArray) -> FloatArray | None:
-    """The matrix (3, 3) whose entries, row by row, homogeneous equations (m, 9) determine; None if they do not."""
+    """Solve homogeneous equations (m, 9) for the entries, row by row, of a matrix (3, 3); None if not unique."""
     _, s, Vt = np.linalg.svd(rows, full_matrices=len(rows) < 9)
     return Vt[-1].reshape(3, 3) if s[7] > _ROUNDING * s[0] else None
 
 
 def decompose_essential(E: FloatArray, x0: FloatArray, x1: FloatArray) -> tuple[Pose, int]:
-    """The one of E's four ``cam1_from_cam0`` with most points (n, 3) in front, with unit t; and how many."""
+    """Return the one of E's four poses ``cam1_from_cam0``, with unit t, that has most points in front; and their
+    number.
+
+    Points are given by their rays (n, 3).
+    """
     U, _, Vt = np.linalg.svd(E)
     U, Vt = U * np.linalg.det(U), Vt * np.linalg.det(Vt)
     W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -70,7 +74,7 @@ def decompose_essential(E: FloatArray, x0: FloatArray, x1: FloatArray) -> tuple[
 @final
 @dataclass(frozen=True, kw_only=True)
 class EightPointSolver(Solver):
-    """Ignores the rolling shutter; gives the left camera's motion, its translation without length."""
+    """Eight-point algorithm for the left camera, which ignores the rolling shutter; d is up to scale."""
 
     spec = SolverSpec(
         needs=frozenset({"left"}),
@@ -102,7 +106,7 @@ class EightPointSolver(Solver):
 @final
 @dataclass(frozen=True, kw_only=True)
 class OpenCvFivePointSolver(Solver):
-    """``cv2.findEssentialMat`` and the decomposition with most points in front, on the left camera.
+    """``cv2.findEssentialMat`` for the left camera, and the decomposition with most points in front.
 
     OpenCV keeps the best five-point model and does not refine it on the others.
     """

@@ -181,7 +181,9 @@ def from_row(motion: FreeMotion, s: float) -> FreeMotion:
 
 @functools.cache
 def places(degree: int) -> NDArray[np.int64]:
-    """(m, m), m = 2 degree + 3: coefficient index of a product of monomials, frame 1 first; -1: none.
+    """Return the index of the coefficient of each product of monomials, (m, m) with m = 2 degree + 3; -1: none.
+
+    Rows are the monomials of frame 1, columns those of frame 0.
 
     Products of the monomials of highest degree of both frames do not occur.
     """
@@ -226,7 +228,7 @@ def refine(start: FreeMotion, rows: Rows, *, turning: bool, most: int) -> tuple[
 
 
 def nearest(start: FreeMotion, F: FloatArray, degree: int, most: int) -> tuple[FreeMotion, float]:
-    """The motion with the smallest component of its unit coefficients orthogonal to F; and the square of that."""
+    """Find the motion whose unit coefficients are nearest to the line of F, and the squared distance."""
     R, vectors, unknowns = np.array(start.R), np.stack(start[1:]), 11 if degree == 1 else 17
     target = (np.zeros((0, 6)), np.ones(2), 0.0, F / np.linalg.norm(F), places(degree))
     cost = descend(R, vectors, unknowns, most, _EXACT**2, target)
@@ -255,16 +257,16 @@ class FreeVelocitySolver(Solver):
     @property
     @abstractmethod
     def least(self) -> int:
-        """Fewest matches."""
+        """Smallest number of matches."""
 
     @property
     @abstractmethod
     def about(self) -> tuple[str, str]:
-        """``reference`` and ``assumes`` of the spec."""
+        """The texts ``reference`` and ``assumes`` of the spec."""
 
     @abstractmethod
     def linear(self, rows: Rows) -> list[FreeMotion] | str:
-        """Linear solutions, up to sign, for rows with s = 0 at the principal point; or why there is none."""
+        """Return linear solutions, up to sign, for s = 0 at the principal point; or why there are none."""
 
     def starts(self, rows: Rows) -> list[FreeMotion]:
         """Further motions from which descents start, for the same rows."""
@@ -364,7 +366,7 @@ def without_velocities(rows: Rows) -> FreeMotion | None:
 
 
 def at_rest_of(E: FloatArray, rows: Rows) -> FreeMotion:
-    """R and t of an essential matrix (3, 3) with most points in front of the cameras; velocities are 0."""
+    """Decompose an essential matrix (3, 3) into R and t with most points in front; velocities are 0."""
     U, _, Vt = np.linalg.svd(E)
     R = U @ QUARTER @ Vt
     motion = FreeMotion(R * np.sign(np.linalg.det(R)), U[:, 2], *np.zeros((4, 3)))

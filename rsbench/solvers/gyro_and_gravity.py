@@ -1,26 +1,27 @@
-"""Solvers that know a part of the rotation: from a gyroscope (``GyroSolver``) or from gravity
+"""Solvers that get part of the rotation from a sensor: a gyroscope (``GyroSolver``) or gravity
 (``UprightSolver``).
 
 C.-R. Lee, J. H. Yoon, M.-G. Park, K.-J. Yoon, Gyroscope-Aided Relative Pose Estimation for Rolling Shutter
-Cameras, 2019, take the angular velocity within the frames from a gyroscope, and the rotation between them, with
-the translation, from five matches. Here the gyroscope gives the whole rotation. For known rotations the exact
+Cameras, 2019, take the angular velocity within the frames from a gyroscope, and estimate the rotation between them
+and the translation from five matches. Here the gyroscope gives the whole rotation. For known rotations, the exact
 constraint of a match,
 
     n . T = 0,   n = R x cross y,   T = tau1 d - tau0 R d + o - R o,   R = R(tau1) R(tau0)^T,
 
-is linear in d: two matches of one camera (o = 0) fix its direction, three of a rig (o, where the camera stands)
-its length too.
+is linear in d. Two matches of one camera (o = 0) determine the direction of d; three matches of a rig (o: offset
+of the camera) determine its length too.
 
 F. Fraundorfer, P. Tanskanen, M. Pollefeys, A Minimal Case Solution to the Calibrated Relative Pose Problem for
-the Case of Two Known Orientation Angles, ECCV 2010, for a global shutter: with the rays of both frames turned
-so that gravity points along y, one angle about y is left of the rotation, and three matches of one camera give
-it and the direction of the translation. On a rig, as a generalised camera of known vertical, four matches give
-the length of the translation too. The minimal solvers are PoseLib's. For many matches of one camera,
+the Case of Two Known Orientation Angles, ECCV 2010, assume a global shutter. After the rays of both frames are
+rotated such that gravity points along y, one angle of the rotation, about y, remains unknown. Three matches of one
+camera determine this angle and the direction of the translation. For a rig, as a generalised camera with known
+vertical, four matches determine the length of the translation too. The minimal solvers are PoseLib's. For many
+matches of one camera,
 
     n . T = 0,   n = R x cross y,   R = A1^T R_y(angle) A0
 
-is linear in T for each angle: the best angle is where the smallest eigenvalue of the sum of n n^T has its
-minimum. From there, least squares of the Sampson error in the angle and d.
+is linear in T for each angle, so the best angle minimises the smallest eigenvalue of the sum of n n^T. The result
+is refined by least squares of the Sampson error over the angle and d.
 """
 
 from __future__ import annotations
@@ -49,15 +50,15 @@ from rsbench.solvers.poselib import MISSING, poselib_module
 _MAX_SCALE_SIGMA = 0.5
 """Relative standard deviation of the length of d above which it does not count as metric, as in ``refined``."""
 _CONTRADICTED = 3.0
-"""Times as many points in front of the cameras for -d as for d, beyond which d has no length."""
+"""Ratio of the points in front of the cameras for -d to those for d, above which |d| is rejected."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSolver(Solver):
-    """Solver for one camera or both, whose rotation is partly given by another sensor."""
+    """Solver for one camera or both, with part of the rotation given by another sensor."""
 
     cameras_used: Literal["left", "both"] = "left"
-    """The left camera's own motion without a length, or the rig's in metres."""
+    """``left``: motion of the left camera, up to scale; ``both``: motion of the rig, in metres."""
 
     @property
     def _stereo(self) -> bool:
@@ -68,7 +69,7 @@ class SensorSolver(Solver):
         return {side: temporal_pairs(correspondences, side) for side in sides}
 
     def _shortage(self, correspondences: Correspondences, sensor: MatchSet) -> MotionEstimate | None:
-        """A failed estimate where there are too few matches or samples; None when there are enough."""
+        """Return a failed estimate if there are too few matches or samples, else None."""
         counts = {side: len(matches) for side, matches in self._matches(correspondences).items()}
         return self.spec.shortage({**counts, sensor: len(getattr(correspondences, sensor))})
 
@@ -76,13 +77,13 @@ class SensorSolver(Solver):
 @final
 @dataclass(frozen=True, kw_only=True)
 class GyroSolver(SensorSolver):
-    """Linear least squares for d, then those of the exact Sampson error; the rotation comes from the samples.
+    """Rotation from gyroscope samples; d by linear least squares, refined on the exact Sampson error.
 
-    Errors of the gyroscope stay: w is its integral.
+    w is the integral of the gyroscope's samples, so its errors are not corrected.
     """
 
     refinement: Literal["none", "sampson"] = "sampson"
-    """``sampson``: least squares of the Sampson errors of all matches at the end; ``none``: without."""
+    """``sampson``: final least squares of the Sampson errors of all matches; ``none``: no refinement."""
 
     @property
     def spec(self) -> SolverSpec:
@@ -132,7 +133,7 @@ class GyroSolver(SensorSolver):
         metric = metric and (not descend or sigma <= _MAX_SCALE_SIGMA)
         if not (np.all(np.isfinite(d)) and np.any(d)):
             return MotionEstimate.failed("no finite translation fits")
-        # Last, because a step of the descent may lead through zero to the other side.
+        # The sign is decided last, because a step of the descent may reverse d.
         d, metric = _signed(motion, d, metric, about, shutter, matches)
         reason = "" if metric else "the length of d is not determined by these matches"
         d = d if self._stereo else d / np.linalg.norm(d)
@@ -140,10 +141,10 @@ class GyroSolver(SensorSolver):
 
 
 def _translation(m: FloatArray, beta: FloatArray) -> tuple[FloatArray | None, bool]:
-    """d (3,) and whether it has a length; None where its direction is open.
+    """Return d (3,), or None if its direction is undetermined, and whether its length is determined.
 
-    The smallest singular vector of [m, beta], as in ``linear.scaled_translation``; of m alone where
-    nothing turns or one camera is used.
+    d follows from the smallest singular vector of [m, beta], as in ``linear.scaled_translation``, or from that of
+    m alone if beta vanishes (no rotation, or one camera) or the length is undetermined.
     """
     sizes = np.linalg.norm(m), np.linalg.norm(beta)
     if not (np.isfinite(sizes[0]) and sizes[0] > 0.0):
@@ -161,9 +162,9 @@ def _translation(m: FloatArray, beta: FloatArray) -> tuple[FloatArray | None, bo
 
 @dataclass(frozen=True)
 class _Constraints:
-    """The exact constraints at known rotations, ``m . d + beta = 0``, and their derivatives by the pixels.
+    """The exact constraints for known rotations, ``m . d + beta = 0``, and their derivatives by the pixels.
 
-    Both are affine in d: their values at no translation and at three unit ones determine them.
+    Both are affine in d, so their values at zero and at three unit translations determine the coefficients.
     """
 
     m: FloatArray
@@ -171,9 +172,9 @@ class _Constraints:
     beta: FloatArray
     """(n,)"""
     q: FloatArray
-    """(n, 4, 3) factors of d in the derivatives by x0, y0, x1, y1."""
+    """(n, 4, 3) coefficients of d in the derivatives by x0, y0, x1, y1, which are q d + q0."""
     q0: FloatArray
-    """(n, 4)"""
+    """(n, 4) constant part of these derivatives."""
 
     @classmethod
     def of(
@@ -189,19 +190,19 @@ class _Constraints:
         return cls(m, beta, np.stack([gradient - q0 for _, gradient in units], axis=-1), q0)
 
     def errors(self, d: FloatArray) -> FloatArray:
-        """Sampson errors (n,), px."""
+        """Return Sampson errors (n,), px."""
         norm = np.linalg.norm(self.q @ d + self.q0, axis=1)
         return np.asarray((self.m @ d + self.beta) / np.maximum(norm, 1e-300))
 
     def jacobian(self, d: FloatArray) -> FloatArray:
-        """(n, 3) of ``errors`` by d."""
+        """Return the derivative (n, 3) of ``errors`` by d."""
         gradient = self.q @ d + self.q0
         norm = np.maximum(np.linalg.norm(gradient, axis=1), 1e-300)[:, None]
         by_norm = np.einsum("ni,nij->nj", gradient, self.q) / norm
         return np.asarray((self.m - self.errors(d)[:, None] * by_norm) / norm)
 
     def refined(self, d: FloatArray) -> tuple[FloatArray, float]:
-        """d of the least squares, and the relative standard deviation of its length."""
+        """Return d from least squares of the Sampson errors, and the relative standard deviation of |d|."""
         if len(self.m) < 3:
             return d, np.inf
         end = scipy.optimize.least_squares(self.errors, d, self.jacobian, method="lm", max_nfev=50, xtol=1e-12)
@@ -223,10 +224,10 @@ def _signed(
     shutter: RollingShutter,
     matches: Mapping[Side, FloatArray],
 ) -> tuple[FloatArray, bool]:
-    """d or -d, whichever has more points in front of the cameras, and whether its length counts.
+    """Choose d or -d by the points in front of the cameras, and return whether its length is valid.
 
-    A length has a sign of its own, which what the gyroscope has wrong may turn: one that most points contradict
-    is none.
+    If the length is known, so is the sign, but errors of the gyroscope may reverse it. If most points contradict
+    the sign, d is reversed and its length is rejected.
     """
     votes = []
     for each in (d, -d):
@@ -245,18 +246,21 @@ _NO_GRAVITY = "no direction of gravity near the start of either frame"
 _ANGLES = 90
 _UPRIGHT_QUICK, _UPRIGHT_FULL = 8, 50
 _LONGEST = 100.0
-"""Metres: pairs whose length is open run there."""
+"""Largest length of d, metres, which the descent reaches if the pairs do not determine the length."""
 
 
 class Uprights(NamedTuple):
-    """Turns (3, 3) of the rays of frame 0 and 1 until things fall along y."""
+    """Rotations (3, 3) of the rays of frames 0 and 1 that align gravity with y."""
 
     first: FloatArray
     second: FloatArray
 
     @classmethod
     def of(cls, gravity: FloatArray) -> Uprights | None:
-        """From the directions (n, 4) nearest to tau = 0 and 1; None where one is missing or has no length."""
+        """Compute the rotations from the directions (n, 4) of gravity nearest to tau = 0 and 1.
+
+        Return None if there is none within half a frame period of either time, or it has no finite length above 0.
+        """
         turns = []
         for frame in (0.0, 1.0):
             near = gravity[np.argsort(np.abs(gravity[:, 0] - frame), kind="stable")[:1]]
@@ -266,25 +270,25 @@ class Uprights(NamedTuple):
             g = near[0, 1:] / length
             axis = so3.cross(g, _DOWN)
             sine = float(np.linalg.norm(axis))
-            # Where it points up, any horizontal axis is as good.
+            # If gravity points along -y, any horizontal axis will do.
             axis = axis / sine if sine > 0.0 else np.array([1.0, 0.0, 0.0])
             turns.append(so3.exp(np.arctan2(sine, g[1]) * axis))
         return cls(*turns)
 
     def rotation(self, angle: float) -> FloatArray:
-        """(3, 3) of the body of frame 1 from frame 0."""
+        """Return the body's rotation (3, 3) from frame 0 to frame 1 for an angle about gravity."""
         return np.asarray(self.second.T @ so3.exp(angle * _DOWN) @ self.first)
 
     def angle(self, w: FloatArray) -> float:
-        """The angle of the nearest rotation that gravity allows."""
+        """Return the angle of the rotation nearest to exp([w]x) that is consistent with gravity."""
         R = self.second @ so3.exp(w) @ self.first.T
         return float(np.arctan2(R[0, 2] - R[2, 0], R[0, 0] + R[2, 2]))
 
 
 def best_angle(x: FloatArray, y: FloatArray) -> tuple[float, FloatArray]:
-    """The angle, and the direction of the translation (3,), of upright rays x, y (n, 3) of one camera; n >= 4.
+    """Return the angle and the direction of translation (3,) for upright rays x, y (n, 3) of one camera; n >= 4.
 
-    The turned normal is ``n = a + cos b + sin c``.
+    The normal of a match is ``n = a + cos(angle) b + sin(angle) c``.
     """
     flat, along = x * [1.0, 0.0, 1.0], x * _DOWN
     parts = np.stack([so3.cross(each, y) for each in (along, flat, so3.cross(_DOWN, flat))])
@@ -310,10 +314,10 @@ def best_angle(x: FloatArray, y: FloatArray) -> tuple[float, FloatArray]:
 @final
 @dataclass(frozen=True, kw_only=True)
 class UprightSolver(SensorSolver):
-    """PoseLib's minimal solvers of known vertical; least squares in what gravity leaves open."""
+    """Minimal solvers of PoseLib for known vertical, then least squares over the remaining angle and d."""
 
     refinement: Literal["upright", "free"] = "upright"
-    """Whether errors of gravity stay in the estimate, or the last least squares refine all three angles."""
+    """``upright``: the given gravity is kept, with its errors; ``free``: all three angles are refined."""
 
     @property
     def spec(self) -> SolverSpec:
@@ -398,7 +402,7 @@ class UprightSolver(SensorSolver):
     def _refined(
         self, up: Uprights, R: FloatArray, d: FloatArray, matches: Correspondences, rig: StereoRig, most: int
     ) -> MotionEstimate:
-        """Least squares of the Sampson error from R (3, 3) and d (3,); without a length, d keeps its own."""
+        """Minimise the Sampson error by least squares, starting from R (3, 3) and d (3,)."""
         about = rig if self._stereo else rig.about("left")
         pairs = Correspondences(**self._given(matches)[0])
         packed = pack(pairs, about, RollingShutter(height=rig.camera.height, readout_ratio=0.0))
@@ -425,20 +429,23 @@ class UprightSolver(SensorSolver):
             variance = 2.0 * end.cost / freedom * (d @ inverse[3:, 3:] @ d)
             metric = bool(np.sqrt(variance) <= _MAX_SCALE_SIGMA * (d @ d))
         if not metric:
-            d = descent.packed.signed(w, d)  # noise alone gives a sign to a length that is open
+            d = descent.packed.signed(w, d)  # if the length is undetermined, noise decides the sign of d
         reason = "" if metric else "the length of d is not determined by these matches"
         return MotionEstimate(w=w, d=d, success=True, metric=metric, reason=reason)
 
 
 @dataclass(frozen=True, eq=False)
 class _Descent:
-    """Least squares of pairs in turns q[:3] about axes (rows, orthonormal) after a rotation, and in d = q[3:]."""
+    """Least squares over q: rotation angles q[:3] about ``axes``, applied after R, and translation d = q[3:].
+
+    The axes are orthonormal rows.
+    """
 
     packed: Packed
     R: FloatArray
     axes: FloatArray
     free: bool
-    """Whether all axes count, or the first alone."""
+    """Whether rotations about all axes are estimated, or only about the first one."""
 
     @property
     def unknowns(self) -> int:
@@ -463,12 +470,12 @@ class _Descent:
 
 
 def _about(axis: FloatArray) -> FloatArray:
-    """Orthonormal rows (3, 3) whose first is a unit vector."""
+    """Return orthonormal rows (3, 3), the first of which is the unit vector ``axis``."""
     rest: FloatArray = scipy.linalg.null_space(axis[None])
     return np.vstack([axis, rest.T])
 
 
 def _sign(R: FloatArray, T: FloatArray, x: FloatArray, y: FloatArray) -> float:
-    """1, or -1 where -T (3,) or (n, 3) has more points of rays x, y (n, 3) in front of both cameras than T."""
+    """Return -1 if -T puts more points of rays x, y (n, 3) in front than T (3,) or (n, 3), else 1."""
     front = [np.count_nonzero(in_front(Pose(R, each), x, y)) for each in (T, -T)]
     return 1.0 if front[0] >= front[1] else -1.0

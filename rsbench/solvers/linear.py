@@ -1,12 +1,13 @@
-"""The paper's linear solver, a reduced and iterated form of it, and null vectors.
+"""The paper's linear solver, a reduced and iterated variant of it, and null vectors.
 
 "Relative Pose Estimation for Stereo Rolling Shutter Cameras", section 2.2: nine left and nine right matches
 over time (or more) give a linear system A X = 0 in 19 unknowns (``LinearSolver``).
 
-The 19 unknowns contain the antisymmetric part of E = [d]x[w]x, which is nearly collinear with d; most of the
-noise sensitivity comes from there. That part is [d x w]x / 2, so with a rotation from the previous pass it
-joins the columns of d (``IteratedSolver``). What remains of the quadratic terms is symmetric, and exact to
-second order (the paper's antisymmetric terms in w w cancel against the second-order rotation that it drops):
+The 19 unknowns contain the antisymmetric part of E = [d]x[w]x. Its columns are nearly collinear with those of d,
+which causes most of the sensitivity to noise. This part is [d x w]x / 2. Given a rotation from the previous pass,
+it is linear in d and is added to the columns of d (``IteratedSolver``). The remaining quadratic terms are
+symmetric, and exact to second order (the paper's antisymmetric terms in w w cancel against the second-order
+rotation that it drops):
 
     15 unknowns  d1 d2 d3 | w2 w3 | sym(E) (6) | w1w2 w1w3 w2w3 w3w3-w2w2
     11 unknowns  without the products of w;  9 unknowns without w2, w3 too (the baseline is ignored)
@@ -29,17 +30,18 @@ from rsbench.solvers.engine.base import MatchSet, MotionEstimate, Solver, Solver
 from rsbench.solvers.engine.packed import Packed, pack
 
 ROUNDING = 1e-10
-"""Below this, relative to the largest, a column norm or singular value is rounding. Exact data of the slowest and
-flattest scenes stay above 1e-7; singular configurations below 1e-14."""
+"""A column norm or singular value below this, relative to the largest one, counts as a rounding error. For exact
+data of the slowest and flattest scenes they are above 1e-7, for singular configurations below 1e-14."""
 
 
 def null_vector(A: FloatArray, unit_columns: bool, rounding: float = ROUNDING) -> tuple[FloatArray | None, str]:
-    """X (columns,) with A X = 0: the right singular vector of the smallest singular value; or why there is none.
+    """Return X (columns,) with A X = 0, the right singular vector of the smallest singular value; or None and a
+    reason.
 
     Args:
         A: (equations, columns).
-        unit_columns: scale the columns to unit length first, which is another estimator wherever A has noise.
-        rounding: what is rounding, relative to the largest column norm or singular value.
+        unit_columns: scale the columns to unit length first, which gives another estimate if A has noise.
+        rounding: relative size below which column norms and singular values count as rounding errors.
     """
     columns = A.shape[1]
     if len(A) < columns - 1:
@@ -60,7 +62,7 @@ SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def symmetric(entries: FloatArray) -> FloatArray:
-    """The matrix (3, 3) of the entries (6,) named by ``SYMMETRIC``."""
+    """Return the symmetric matrix (3, 3) with the entries (6,) in the order of ``SYMMETRIC``."""
     out = np.zeros((3, 3))
     for value, (i, j) in zip(entries, SYMMETRIC, strict=True):
         out[i, j] = out[j, i] = value
@@ -68,7 +70,7 @@ def symmetric(entries: FloatArray) -> FloatArray:
 
 
 def rotation_from_essential(E: FloatArray, d: FloatArray, symmetric: bool) -> FloatArray:
-    """w (3,) from E = [d]x[w]x = w d^T - (d.w) I, by least squares over all nine entries or the symmetric part."""
+    """Solve E = [d]x[w]x = w d^T - (d.w) I for w (3,) by least squares over all entries or the symmetric part."""
     basis = np.eye(3)
     columns = np.stack([np.outer(e, d) - d[k] * np.eye(3) for k, e in enumerate(basis)])
     if symmetric:
@@ -78,15 +80,15 @@ def rotation_from_essential(E: FloatArray, d: FloatArray, symmetric: bool) -> Fl
 
 
 def pair_rays(pairs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rays (n, 3), z = 1, of both ends of pairs (n, 7 or 17)."""
+    """Return rays (n, 3), z = 1, of both ends of pairs (n, 7 or 17)."""
     ones = np.ones((len(pairs), 1))
     return np.hstack([pairs[:, :2], ones]), np.hstack([pairs[:, 2:4], ones])
 
 
 def scaled_translation(pairs: FloatArray, w: FloatArray, limit: float) -> FloatArray | None:
-    """d (3,) in metres for a known rotation; None when the pairs do not hold its length.
+    """Return d (3,) in metres for a known rotation; None if the pairs do not determine a length below ``limit``.
 
-    For a given w the exact constraint of the paper's motion is linear in d: ``m . d + beta = 0``; the smallest
+    For a given w, the exact constraint of the paper's motion is linear in d: ``m . d + beta = 0``. The smallest
     singular vector of [m, beta] gives d with its length.
     """
     x, y = pair_rays(pairs)
@@ -108,7 +110,7 @@ def scaled_translation(pairs: FloatArray, w: FloatArray, limit: float) -> FloatA
 def system_rows(
     matches: FloatArray, side: Side, rig: StereoRig, shutter: RollingShutter, third_order: bool = False
 ) -> FloatArray:
-    """Rows (n, 19) of A_1 (left) or A_2 (right), paper eq. 7-10, of matches (n, 4) x0, y0, x1, y1.
+    """Return rows (n, 19) of A_1 (left) or A_2 (right), paper eq. 7-10, for matches (n, 4) x0, y0, x1, y1.
 
     With x, y the rays of frames 0 and 1, ``a = k3 - k1`` and s b the camera's offset, eq. 7 (s = 1) and 8
     (s = -1) give, without the eight third-order unknowns S,
@@ -144,7 +146,7 @@ def system_rows(
 
 
 def far_apart(matches: FloatArray, count: int) -> FloatArray:
-    """``count`` of the matches (n, 4) that stand far from each other in frame 0: each farthest from those before.
+    """Select ``count`` of the matches (n, 4) that are far from each other in frame 0, by farthest-point sampling.
 
     T. Gonzalez, Clustering to minimize the maximum intercluster distance, 1985.
     """
@@ -161,28 +163,28 @@ def far_apart(matches: FloatArray, count: int) -> FloatArray:
 @final
 @dataclass(frozen=True, kw_only=True)
 class LinearSolver(Solver):
-    """The paper's solver; each choice that the paper leaves open is a parameter.
+    """The paper's solver; each choice that the paper does not specify is a parameter.
 
-    The defaults are the literal reading: X is the right singular vector of the smallest singular value of A as
-    equations 7 to 10 make it, of normalised rays and a baseline in metres. The paper does not say how w, d and the
-    scale come out of X.
-    Known defects, kept: rotation is truncated inconsistently (w2w2 and w3w3 would be inseparable otherwise);
-    antisymmetric E is nearly collinear with d, so noise reaches the rotation; without readout (phi = 0) or with
-    pure translation the system is singular.
+    The defaults take the paper literally: X is the right singular vector of the smallest singular value of A from
+    equations 7 to 10, with normalised rays and a baseline in metres. The paper does not specify how w, d and the
+    scale are computed from X.
+    Known defects are kept: the rotation is truncated inconsistently (otherwise w2w2 and w3w3 would be
+    inseparable); the antisymmetric part of E is nearly collinear with d, so the rotation is sensitive to noise;
+    for a global shutter (phi = 0) or a pure translation, the system is singular.
     """
 
     sampling: Literal["all", "nine-apart"] = "all"
-    """Matches that are used: all, or nine of each camera that stand far apart."""
+    """Matches that are used: all, or nine of each camera that are far apart in the image."""
     terms: Literal["second", "third"] = "second"
-    """Order of the terms in the motion that A holds: 19 unknowns, or the 27 of which the paper drops eight."""
+    """Highest order in the motion of the terms in A: 19 unknowns, or 27 with the eight that the paper drops."""
     scaling: Literal["none", "unit-columns"] = "none"
     """Scaling of the columns of A before the singular value decomposition; unit columns are worse with noise."""
     baseline_unit: Literal["metre", "half-baseline"] = "metre"
     """Unit of length in A: metres, or the paper's b."""
     extraction: Literal["full", "symmetric"] = "full"
-    """Entries of E = [d]x[w]x that give w: all nine, or the symmetric part, which noise reaches less."""
+    """Entries of E = [d]x[w]x that give w: all, or the symmetric part, which is less sensitive to noise."""
     scale: Literal["rotation", "constraint"] = "rotation"
-    """Source of the length of d: the two entries of X with w alone, or the exact constraint at this w."""
+    """Source of the length of d: the entries of X for w2 and w3, or the exact constraint for the estimated w."""
     sign: Literal["cheirality", "scale"] = "cheirality"
     """Source of the sign of d: the points in front of the cameras, or the sign of the scale."""
 
@@ -228,7 +230,7 @@ class LinearSolver(Solver):
         return MotionEstimate(w=w, d=d, success=True, metric=True)
 
     def _translation(self, X: FloatArray, w: FloatArray, unit: float, packed: Packed) -> FloatArray | None:
-        """d (3,) in metres from X, which holds it times an unknown factor; None when that cannot be known."""
+        """Return d (3,) in metres from X, which is known up to a factor; None if the factor is undetermined."""
         factor = float(X[3:5] @ w[1:]) / max(float(w[1:] @ w[1:]), 1e-300)
         if factor == 0.0:
             return None
@@ -242,9 +244,9 @@ class LinearSolver(Solver):
 
 
 def reduced_blocks(pairs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Columns of d (n, 3), their part that the rotation shifts (n, 3), and the other columns (n, 12).
+    """Return two blocks (n, 3) for the columns of d, and the other columns (n, 12).
 
-    The columns of d are the first plus ``cross(w, second)``.
+    For a rotation w, the columns of d are ``first + cross(w, second)``.
     """
     x, y = pair_rays(pairs)
     k1, k3, sb = pairs[:, 4], pairs[:, 5], pairs[:, 6]
@@ -261,7 +263,7 @@ def reduced_blocks(pairs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 def solve_reduced(pairs: FloatArray, unknowns: int, passes: int) -> tuple[FloatArray, FloatArray] | str:
-    """``(w, d)`` of pairs (n, 7), d of arbitrary length and sign; or why there is none."""
+    """Return ``(w, d)`` from pairs (n, 7), with d of length 1 and any sign; or the reason of a failure."""
     by_d, shifted, rest = reduced_blocks(pairs)
     rest = rest[:, {15: slice(12), 11: slice(8), 9: slice(2, 8)}[unknowns]]
     first_E = 3 + (0 if unknowns == 9 else 2)
@@ -280,10 +282,10 @@ def solve_reduced(pairs: FloatArray, unknowns: int, passes: int) -> tuple[FloatA
 
 
 def length_from_tracks(tracks: FloatArray, packed: Packed, w: FloatArray, u: FloatArray) -> float | None:
-    """Signed length, metres, of a translation along u (3,) for a known rotation, from tracks; or None.
+    """Return the signed length, metres, of a translation along u (3,) for a known rotation, from tracks; or None.
 
-    A left-right match holds its point's inverse depth rho, so that ``y x (R x + rho s T(u)) = 0`` is linear in the
-    length s, which is one least-squares quotient over all tracks. If each end of a track has its own time (tracks
+    A left-right match gives its point's inverse depth rho, so that ``y x (R x + rho s T(u)) = 0`` is linear in the
+    length s, and s is a least-squares quotient over all tracks. If each end of a track has its own time (tracks
     (n, 4, 9)), the equations of the four rays are linear in s and the point, which is eliminated.
     """
     if tracks.ndim == 3:
@@ -301,7 +303,7 @@ def length_from_tracks(tracks: FloatArray, packed: Packed, w: FloatArray, u: Flo
 
 
 def _length_from_rays(tracks: FloatArray, baseline: float, w: FloatArray, u: FloatArray) -> float | None:
-    """The same of tracks (n, 4, 9), over the depth as frame 0 shows it, for errors to be those of rays."""
+    """Do the same for tracks (n, 4, 9); dividing by the depth from frame 0 makes the residuals errors of rays."""
     rho = np.maximum(tracks[:, 0, 0] - tracks[:, 1, 0], 0.0)[:, None, None] / baseline
     x, tau = tracks[:, :, :2, None], tracks[:, :, 2, None]
     R, o = so3.exp(tau * w), baseline * np.array([[0.5], [-0.5], [0.5], [-0.5]]) * np.array([1.0, 0.0, 0.0])
@@ -318,20 +320,21 @@ def _length_from_rays(tracks: FloatArray, baseline: float, w: FloatArray, u: Flo
 @final
 @dataclass(frozen=True, kw_only=True)
 class IteratedSolver(Solver):
-    """Singular value decompositions with the rotation of the last pass folded in; no descent, no starts.
+    """The reduced linear system, solved by repeated SVD with the rotation of the previous pass; no descent.
 
-    Columns are scaled to unit length, unlike the paper's solver read literally: the median stays the same, and the
-    mean with nine matches or at 0.8 px is a third better. This is what the refined solver starts from with pairs.
+    Columns are scaled to unit length, unlike in the paper. This leaves the median error unchanged and lowers the
+    mean error with nine matches or at 0.8 px of noise by a third. The refined solver starts from this solution
+    with pairs.
     """
 
     unknowns: Literal[9, 11, 15] = 15
     """Unknowns of the linear system: 15; 11 without the products of w; 9 without w2 and w3 too."""
     scale: Literal["pairs", "tracks"] = "pairs"
-    """Where the length of d comes from: the pairs, by the columns of the baseline, or left-right matches."""
+    """Source of the length of d: the exact constraint of the pairs, or left-right matches of tracks."""
     passes: int = 5
-    """Rounds of reweighted linear least squares."""
+    """Number of solutions of the linear system, each with the rotation of the previous one."""
     max_translation_m: float = 50.0
-    """Longest translation per frame period that counts as known length."""
+    """Largest length of d per frame period that counts as determined, metres."""
 
     def __post_init__(self) -> None:
         check_whole("passes", self.passes, 1, 10_000)
@@ -371,7 +374,7 @@ class IteratedSolver(Solver):
 
 
 def with_scale_and_sign(packed: Packed, w: FloatArray, d: FloatArray, limit: float) -> MotionEstimate:
-    """Estimate with the direction of d, its sign from cheirality and its length from ``scaled_translation``."""
+    """Return the estimate with the sign of d from cheirality and its length from ``scaled_translation``."""
     scaled = scaled_translation(packed.pairs, w, limit)
     metric = scaled is not None
     if scaled is not None:

@@ -1,10 +1,10 @@
 """Global-shutter solvers of PoseLib: five points of the left camera, all pairs of the rig, pose from points.
 
-V. Larsson et al., PoseLib. It minimises the Sampson or the reprojection error without robust loss here: the
-robust loop around a solver rejects outliers, the same loop for every solver. ``P3pSolver`` alone has PoseLib's
-own loop: the stereo pair of frame 0 gives the points, whose images in frame 1 give the pose by LO-RANSAC on
-those of the left camera (M. Persson, K. Nordberg, Lambda Twist P3P, ECCV 2018), then least squares of the
-reprojection errors of the inliers, of both cameras.
+V. Larsson et al., PoseLib. Here PoseLib minimises the Sampson or the reprojection error without a robust loss,
+because rsbench's robust loop, the same for every solver, rejects outliers. Only ``P3pSolver`` uses PoseLib's own
+loop: points are triangulated from the stereo pair of frame 0, the pose follows from their left images in frame 1
+by LO-RANSAC (M. Persson, K. Nordberg, Lambda Twist P3P, ECCV 2018), and is refined by least squares of the
+inliers' reprojection errors in both cameras.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ _NOT_FINITE = "poselib returned no finite pose"
 
 
 class PoselibSolver(Solver):
-    """A solver whose final estimate is one of PoseLib's refinements."""
+    """Base class of solvers whose final estimate is a refinement by PoseLib."""
 
     @abstractmethod
     def refined(
         self, poselib: Any, start: Any, correspondences: Correspondences, rig: StereoRig, options: dict[str, Any]
     ) -> Any:
-        """The pose that PoseLib finds from a pose to start at; both are PoseLib's ``CameraPose``."""
+        """Return the pose refined by PoseLib from a starting pose; both are PoseLib's ``CameraPose``."""
 
     def improve(
         self,
@@ -64,7 +64,7 @@ class PoselibSolver(Solver):
 
 
 def poselib_module() -> Any:
-    """The module, or None where it has no wheel."""
+    """Return the module ``poselib``, or None if it is not installed (there is no wheel for some platforms)."""
     try:
         import poselib
     except ImportError:
@@ -73,7 +73,7 @@ def poselib_module() -> Any:
 
 
 def poselib_camera(camera: PinholeCamera) -> dict[str, Any]:
-    """The camera as PoseLib describes it; ValueError for a lens, since PoseLib gets matches without one."""
+    """Return the camera in PoseLib's format; ValueError for a lens, as PoseLib gets ideal pixels."""
     if camera.lens is not None:
         raise ValueError("PoseLib is given matches without a lens")
     return {
@@ -104,7 +104,7 @@ def estimate_of(pose: Any, metric: bool) -> MotionEstimate:
 
 
 def five_point_motions(matches: FloatArray, rig: StereoRig) -> list[MotionEstimate]:
-    """Motions of the camera of matches (5, 4): PoseLib's five-point solver, points in front."""
+    """Return motions of the left camera from matches (5, 4), by PoseLib's five-point solver with cheirality."""
     poselib = poselib_module()
     if poselib is None:
         return [MotionEstimate.failed(MISSING)]
@@ -117,7 +117,7 @@ def five_point_motions(matches: FloatArray, rig: StereoRig) -> list[MotionEstima
 
 @dataclass(frozen=True, kw_only=True)
 class PoselibPairsSolver(PoselibSolver):
-    """From the left camera's motion: its length is 1, or half a baseline where the refinement finds it."""
+    """Solver that refines the left camera's motion; |d| starts at 1, or at half a baseline if it is estimated."""
 
     def _length(self, rig: StereoRig) -> float:
         return 0.5 * rig.baseline if self.spec.metric else 1.0
@@ -146,7 +146,7 @@ class PoselibPairsSolver(PoselibSolver):
 @final
 @dataclass(frozen=True, kw_only=True)
 class PoselibMonoSolver(PoselibPairsSolver):
-    """Left camera only: five-point proposals, then the Sampson error of all matches."""
+    """Left camera only: five-point samples, then least squares of the Sampson errors of all matches."""
 
     spec = SolverSpec(
         needs=frozenset({"left"}),
@@ -203,7 +203,7 @@ class PoselibStereoSolver(PoselibPairsSolver):
 @final
 @dataclass(frozen=True, kw_only=True)
 class PoselibPnpSolver(PoselibSolver):
-    """Points from the disparities of frame 0, then the pose of frame 1's stereo pair from them."""
+    """Points from the disparities of frame 0, then the absolute pose of the stereo pair of frame 1."""
 
     spec = SolverSpec(
         needs=frozenset({"tracks"}),
@@ -221,7 +221,7 @@ class PoselibPnpSolver(PoselibSolver):
     ) -> MotionEstimate:
         if short := shortage_of_depth(with_depth(correspondences.tracks), self.spec.minimum["tracks"]):
             return short
-        # A frame's motion is small: no motion at all is as good a start as a minimal solver's.
+        # The motion in one frame is small: zero motion is as good a start as a minimal solver's result.
         still = MotionEstimate(w=np.zeros(3), d=np.zeros(3), success=True)
         return self.improve(still, correspondences, rig, shutter)
 
@@ -236,7 +236,7 @@ class PoselibPnpSolver(PoselibSolver):
             return []
         rays = rig.camera.unproject(tracks[:3, 4:6])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        # Points in the body; the left camera of frame 1 sees them at R x + d + offset.
+        # The points x are in the body; in the left camera of frame 1 they are at R x + d + offset.
         poses = poselib.p3p(rays, stereo_points(tracks[:3], rig))
         motions = [(so3.log(np.array(p.R)), np.array(p.t) - rig.offset("left")) for p in poses]
         return [MotionEstimate(w=w, d=d, success=True, metric=True) for w, d in motions if np.all(np.isfinite(d))]
@@ -257,7 +257,7 @@ def pose_of_points(
     rig: StereoRig,
     options: dict[str, Any],
 ) -> Any:
-    """PoseLib's pose of the body from the points of tracks (n, 8) and the pixels of frame 1 that masks name."""
+    """Return PoseLib's pose of the body from points of tracks (n, 8) and their masked pixels in frame 1."""
     points = stereo_points(tracks, rig)
     pose, _ = poselib.refine_generalized_absolute_pose(
         [tracks[mask, FRAME_1[side]] for side, mask in used.items()],
@@ -271,29 +271,29 @@ def pose_of_points(
 
 
 def shortage_of_depth(tracks: FloatArray, least: int) -> MotionEstimate | None:
-    """A failed estimate where too few tracks have depth; None when there are enough."""
+    """Return a failed estimate if too few tracks have depth, else None."""
     if len(tracks) >= least:
         return None
     return MotionEstimate.failed(f"{len(tracks)} tracks with positive disparity, need {least}")
 
 
 _LEAST = 10
-"""Samples, as in rsbench's own robust loop."""
+"""Smallest number of samples, as in rsbench's own robust loop."""
 
 
 @final
 @dataclass(frozen=True, kw_only=True)
 class P3pSolver(Solver):
-    """PoseLib's robust absolute pose; a card of it says ``robust = "own"``."""
+    """PoseLib's robust absolute pose; its card has ``robust = "own"``."""
 
     cameras_used: Literal["left", "both"] = "both"
-    """Cameras whose pixels of frame 1 count in the final estimate; the search uses the left camera's."""
+    """Cameras whose pixels in frame 1 are used in the final estimate; the search uses only the left camera's."""
     threshold_px: float = 4.0
-    """Largest reprojection error of an inlier: beyond the noise of pixels and points, on a rolling shutter too."""
+    """Largest reprojection error of an inlier; allows for noise of pixels and points and a rolling shutter."""
     confidence: float = 0.999
-    """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
+    """Required probability that RANSAC draws a sample without outliers, 0 to 1."""
     max_iterations: int = 1000
-    """Samples that RANSAC draws, at most."""
+    """Largest number of RANSAC samples."""
 
     def __post_init__(self) -> None:
         check_number("threshold_px", self.threshold_px, 0.0)
@@ -338,7 +338,7 @@ class P3pSolver(Solver):
         return estimate_of(pose_of_points(poselib, start, tracks, near, rig, _BUNDLE), self.spec.metric)
 
     def _near(self, pose: Any, points: FloatArray, pixels: FloatArray, rig: StereoRig, side: Side) -> BoolArray:
-        """Mask (n,) of the pixels of frame 1 near which a pose of the body shows its points."""
+        """Return the mask (n,) of pixels in frame 1 whose reprojection error is below the threshold."""
         seen = points @ np.array(pose.R).T + np.array(pose.t) + rig.offset(side)
         front = seen[:, 2] > 0.0
         error = np.linalg.norm(rig.camera.project(np.where(front[:, None], seen, 1.0)) - pixels, axis=1)

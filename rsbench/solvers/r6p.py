@@ -1,29 +1,32 @@
-"""Absolute pose of a rolling-shutter frame from six points, on the stereo depth of the frame before.
+"""Absolute pose of a rolling-shutter frame from six points, whose depth is from the stereo pair of the frame
+before.
 
-C. Albl, Z. Kukelova, T. Pajdla, R6P: Rolling Shutter Absolute Camera Pose, CVPR 2015, let the camera turn and
-move at constant velocity while it reads. With s the time since the first row,
+C. Albl, Z. Kukelova, T. Pajdla, R6P: Rolling Shutter Absolute Camera Pose, CVPR 2015, assume constant angular and
+linear velocity during the readout. With s the time since the first row,
 
     lambda x = (I + s [w']x) R X + C + s t'      (single linearisation)
     lambda x = (I + s [w']x) (I + [v]x) X + C + s t'      (double linearisation, R near the identity).
 
 Six points give twelve equations. Z. Kukelova, C. Albl, A. Sugimoto, T. Pajdla, Linear Solution to the Minimal
-Absolute Pose Rolling Shutter Problem, ACCV 2018, solve the double linearisation with [w']x [v]x X frozen at the
-v of the step before: a few linear steps. Here these are Newton's, linear about the w' of the step before too:
-as dear, and of cameras that turn by 30 degrees within the frame they end at the solution in 9 of 10 samples,
-where frozen ones do in 6. The single one (C. Albl, Z. Kukelova, V. Larsson, T. Pajdla, Rolling Shutter Camera
-Absolute Pose, PAMI 2020, by a Groebner basis) is solved by the same steps, whose v turns R after each.
-Algebraic solvers give all solutions; this gives one, next to the orientation of frame 0.
+Absolute Pose Rolling Shutter Problem, ACCV 2018, solve the double linearisation in a few linear steps, in which
+the v in [w']x [v]x X is fixed to its value from the previous step. Here Newton steps are used, which also
+linearise about the previous w'. They cost the same, and for cameras that rotate by 30 degrees within the frame
+they converge in 9 of 10 samples instead of 6. The single linearisation (C. Albl, Z. Kukelova, V. Larsson, T.
+Pajdla, Rolling Shutter Camera Absolute Pose, PAMI 2020, by a Groebner basis) is solved by the same steps, with v
+applied to R after each step. Algebraic solvers give all solutions; this solver gives one, near its initial
+orientation.
 
-As published, P3P turns the points first, so that R is near the identity, and samples are judged by the
-reprojection errors of all twelve unknowns, not by the pose alone: of free velocities the pose of six points is
-far off where the whole of them fits.
+As published, P3P first rotates the points, so that R is near the identity. Samples are scored by the reprojection
+errors for all twelve unknowns, not by the pose alone: with free velocities, the pose from six points may be far
+off although pose and velocities together fit.
 
-Points of one plane leave one combination open to first order: facing it at Z and at rest, with s = a (y - y0),
-a pitch of 1, a rise of Z and a speed of -Z / a along the axis. Noise decides it (compare C. Albl, A. Sugimoto,
-T. Pajdla, Degeneracies in Rolling Shutter SfM, ECCV 2016).
+For coplanar points, one combination of unknowns is undetermined to first order. For a camera at rest that faces
+the plane at distance Z, with s = a (y - y0), it is a pitch of 1 with a rise of Z and a speed of -Z / a along the
+axis. Noise then determines it (compare C. Albl, A. Sugimoto, T. Pajdla, Degeneracies in Rolling Shutter SfM, ECCV
+2016).
 
-The points are from the stereo pair of frame 0, whose rows move too: see ``R6pSolver.frame_0``. All lies in the
-body's axes, so that C is its translation.
+The points come from the stereo pair of frame 0, whose rows are read at different times too: see
+``R6pSolver.frame_0``. All quantities are in the body's axes, so that C is the body's translation.
 """
 
 from __future__ import annotations
@@ -44,14 +47,14 @@ from rsbench.solvers.poselib import P3pSolver, shortage_of_depth
 
 _LEAST = 6
 _STEPS = 6
-"""Newton's; four leave rounding where the camera turns by some degrees."""
+"""Largest number of Newton steps; four suffice, up to rounding errors, if the camera rotates by a few degrees."""
 _QUICK, _FULL = 4, 20
 _SMALL = 1e-13
 _OPEN = "the matches leave the pose and the velocity of frame 1 open"
 
 
 class RowPose(NamedTuple):
-    """The body at frame 1's first row, ``R X + C``, and its velocities, per frame period; batch axes (...)."""
+    """Body pose at the first row of frame 1, ``R X + C``, and velocities per frame period; batch axes (...)."""
 
     R: FloatArray
     """(..., 3, 3)"""
@@ -64,32 +67,32 @@ class RowPose(NamedTuple):
 
     @property
     def finite(self) -> FloatArray:
-        """(...) bool"""
+        """Whether all values are finite, (...) bool."""
         whole = np.concatenate([self.R.reshape(*self.C.shape[:-1], 9), *self[1:]], axis=-1)
         return np.asarray(np.all(np.isfinite(whole), axis=-1))
 
 
 class Resection(NamedTuple):
-    """Points and what frame 1 shows of them; batch axes (...)."""
+    """Points from frame 0 and their images in frame 1; batch axes (...)."""
 
     body: FloatArray
-    """(..., n, 3) in the body as it is when frame 0 reads them, metres."""
+    """(..., n, 3) points in the body at the time when frame 0 reads them, metres."""
     tau0: FloatArray
-    """(..., n) of these rows, 0 where frame 0 is taken as still."""
+    """(..., n) these times; 0 if motion during frame 0 is ignored."""
     x: FloatArray
     """(..., c, n, 3) rays of c cameras, z = 1."""
     s: FloatArray
     """(..., c, n) frame periods since the first row of frame 1."""
     offset: FloatArray
-    """(c, 1, 3)"""
+    """(c, 1, 3) offsets of the cameras, metres."""
     focal: FloatArray
-    """(2,) px."""
+    """(2,) focal lengths, px."""
 
     @classmethod
     def of(
         cls, tracks: FloatArray, rig: StereoRig, shutter: RollingShutter, sides: tuple[Side, ...], moved: bool
     ) -> Resection:
-        """From tracks (n, 8) with depth."""
+        """Convert tracks (n, 8) with depth; ``moved``: whether motion during frame 0 is modelled."""
         tau0 = shutter.pixel_time(tracks[:, :2], 0, "left")
         return cls(
             stereo_points(tracks, rig),
@@ -101,7 +104,7 @@ class Resection(NamedTuple):
         )
 
     def in_samples(self, count: int) -> Resection:
-        """(n,) as (count, n / count)."""
+        """Split the points (n,) into samples (count, n / count)."""
         c = len(self.x)
         return self._replace(
             body=self.body.reshape(count, -1, 3),
@@ -111,20 +114,23 @@ class Resection(NamedTuple):
         )
 
     def points(self, w: FloatArray, d: FloatArray) -> FloatArray:
-        """(..., n, 3) at time 0, of a body that moves with R = exp(tau w), t = tau d; w, d (..., 3)."""
+        """Return the points (..., n, 3) at time 0 for a body motion R = exp(tau w), t = tau d; w, d (..., 3)."""
         tau = self.tau0[..., None]
         back = so3.exp(-tau * w[..., None, :])
         return np.asarray((back @ (self.body - tau * d[..., None, :])[..., None])[..., 0])
 
 
 def newton_step(data: Resection, X: FloatArray, v: FloatArray, w: FloatArray) -> FloatArray:
-    """v, C, w', t' (..., 12) of points X (..., n, 3), linear about v and w (..., 3); NaN where open."""
+    """Solve for v, C, w', t' (..., 12) from points X (..., n, 3), linearised about v and w' = ``w`` (..., 3).
+
+    The result is NaN if the pose is undetermined.
+    """
     X, v, w = X[..., None, :, :], v[..., None, None, :], w[..., None, None, :]
     s, swept = data.s[..., None, None], so3.cross(v, X)
     eye = np.broadcast_to(np.eye(3), (*data.s.shape, 3, 3))
     columns = np.concatenate([-(eye + s * hat(w)) @ hat(X), eye, -s * hat(X + swept), s * eye], axis=-1)
     rest = X + data.offset - s[..., 0] * so3.cross(w, swept)
-    # x P_z = P_x and y P_z = P_y, over the depth: errors of rays.
+    # The equations x P_z = P_x and y P_z = P_y are divided by the depth, so that residuals are errors of rays.
     A = (columns[..., :2, :] - data.x[..., :2, None] * columns[..., 2:, :]) / X[..., 2:, None]
     y = (data.x[..., :2] * rest[..., 2:] - rest[..., :2]) / X[..., 2:]
     batch = data.s.shape[:-2]
@@ -132,7 +138,8 @@ def newton_step(data: Resection, X: FloatArray, v: FloatArray, w: FloatArray) ->
 
 
 def _solved(A: FloatArray, y: FloatArray) -> FloatArray:
-    """Least squares (..., 12), the shortest where velocities are open; NaN where the pose is, too."""
+    """Return the least-squares solution (..., 12), of minimum norm if A is rank-deficient; NaN if the rank is
+    below 6."""
     if A.shape[-2] == A.shape[-1]:
         try:
             return np.linalg.solve(A, y[..., None])[..., 0].astype(np.float64)
@@ -148,12 +155,12 @@ def _solved(A: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def linear_pose(data: Resection, turning: bool, R0: FloatArray) -> RowPose:
-    """The pose that the steps end at; NaN where there is none.
+    """Return the pose after Newton steps; NaN if it is undetermined.
 
     Args:
-        data: points and what is seen of them.
-        turning: whether v turns R after each step, so that it vanishes: the single linearisation.
-        R0: (3, 3) where R begins; the double linearisation is about it.
+        data: points and their images.
+        turning: whether v is applied to R after each step and reset to zero (single linearisation).
+        R0: (3, 3) initial R; the double linearisation is about it.
     """
     batch = data.body.shape[:-2]
     R: FloatArray = np.broadcast_to(R0, (*batch, 3, 3))
@@ -174,9 +181,10 @@ def linear_pose(data: Resection, turning: bool, R0: FloatArray) -> RowPose:
 
 
 def errors(data: Resection, pose: RowPose, X: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Reprojection errors (m,) in px, infinite behind the cameras, and their derivatives (m, 12).
+    """Return reprojection errors (m,) in px, infinite behind the cameras, and their derivatives (m, 12).
 
-    The body of row s is ``exp(s w') R X + C + s t'``. Derivatives are by a turn of R from the left, C, w', t'.
+    At row time s, a point is at ``exp(s w') R X + C + s t'`` in the body. Derivatives are by a rotation that
+    multiplies R from the left, C, w' and t'.
     """
     s = data.s[..., None, None]
     turn = so3.exp(s[..., 0] * pose.w)
@@ -193,9 +201,9 @@ def errors(data: Resection, pose: RowPose, X: FloatArray) -> tuple[FloatArray, F
 
 
 def refined(data: Resection, start: RowPose, most: int) -> RowPose:
-    """Least squares of ``errors`` by Gauss-Newton, of points that move with the pose of the step before.
+    """Minimise ``errors`` by Gauss-Newton; in each step, points are moved to time 0 with the previous pose.
 
-    The start where the descent leaves what is finite or ends no better.
+    Return the best pose found, which may be the start.
     """
     pose, best, lowest = start, start, np.inf
     for _ in range(most):
@@ -213,7 +221,7 @@ def refined(data: Resection, start: RowPose, most: int) -> RowPose:
 
 
 class _Search:
-    """The estimator for LO-RANSAC: all twelve unknowns of a sample, judged by their own reprojection."""
+    """Estimator for LO-RANSAC; models have all twelve unknowns and are scored by reprojection errors."""
 
     sample_size = (_LEAST,)
 
@@ -223,7 +231,7 @@ class _Search:
         self.data, self.num_data = self.of(tracks), (len(tracks),)
 
     def of(self, tracks: FloatArray, minimal: bool = False) -> Resection:
-        """The data of some tracks (n, 8); minimal samples use the left camera alone."""
+        """Convert tracks (n, 8) for the cameras used; minimal samples use the left camera alone."""
         sides: tuple[Side, ...] = ("left",) if minimal else self.solver.sides
         return Resection.of(tracks, self.rig, self.shutter, sides, self.solver.frame_0 == "moved")
 
@@ -237,7 +245,7 @@ class _Search:
         return [[pose] if pose.finite else [] for pose in poses]
 
     def residuals(self, model: RowPose) -> FloatArray:
-        """(n,) px, of the camera that errs more."""
+        """Return the reprojection errors (n,), px, in the camera with the larger error."""
         with np.errstate(all="ignore"):
             e, _ = errors(self.data, model, self.data.points(so3.log(model.R), model.C))
             squares = np.sum(e.reshape(len(self.data.x), -1, 2) ** 2, axis=-1)
@@ -247,7 +255,7 @@ class _Search:
         return self.fit(inliers, model, _QUICK)
 
     def fit(self, inliers: BoolArray, start: RowPose | None, most: int) -> RowPose | None:
-        """The pose of all inliers together, from a start if there is one."""
+        """Fit a pose to all inliers, from a start if one is given; None if it is not finite."""
         data = self.of(self.tracks[inliers])
         if start is None or self.solver.refinement == "none":
             start = self.linear(data)
@@ -260,27 +268,28 @@ class _Search:
 @final
 @dataclass(frozen=True, kw_only=True)
 class R6pSolver(Solver):
-    """Six points or more: Newton's steps, then least squares of the reprojection error of exact rotations."""
+    """Pose from six points or more: Newton steps, then least squares of the exact reprojection error."""
 
     linearisation: Literal["double", "single"] = "double"
-    """Whether R is linearised about no rotation, beside the rotation within the frame."""
+    """``single``: only the rotation within the frame is linearised; ``double``: R too."""
     frame_0: Literal["moved", "still"] = "moved"
-    """Whether the points of each row of frame 0 are moved to time 0 with the motion of the step before (constant
-    velocity from frame to frame: it ends where points and pose agree), or taken as they are, as of a known map."""
+    """``moved``: the points of each row of frame 0 are moved to time 0 with the current estimate of the motion (at
+    constant velocity from frame to frame), until points and pose agree; ``still``: they are used as points of a
+    map."""
     cameras_used: Literal["left", "both"] = "both"
-    """Cameras whose pixels of frame 1 count; minimal samples take the left camera's alone."""
+    """Cameras whose pixels in frame 1 are used; minimal samples use only the left camera's."""
     refinement: Literal["none", "reprojection"] = "reprojection"
-    """``reprojection``: least squares of the reprojection errors of all inliers at the end; ``none``: without."""
+    """``reprojection``: final least squares of the reprojection errors of all inliers; ``none``: no refinement."""
     start: Literal["p3p", "still"] = "p3p"
-    """Whether R begins at the orientation that P3P gives of all matches, as published, or at frame 0's."""
+    """Initial orientation: that of P3P for all matches, as published, or that of frame 0."""
     threshold_px: float = 4.0
-    """Largest reprojection error of an inlier: beyond the noise of pixels and points."""
+    """Largest reprojection error of an inlier; it allows for noise of pixels and of points."""
     confidence: float = 0.999
-    """Probability with which RANSAC shall have seen a sample without outliers, 0 to 1."""
+    """Required probability that RANSAC draws a sample without outliers, 0 to 1."""
     max_iterations: int = 1000
-    """Samples that RANSAC draws, at most."""
+    """Largest number of RANSAC samples."""
     lo_steps: int = 3
-    """Refinements of each better sample; 0: of the last one alone."""
+    """Number of refinements of each new best model of RANSAC; 0: refine only at the end."""
 
     def __post_init__(self) -> None:
         self._options()
@@ -304,7 +313,7 @@ class R6pSolver(Solver):
             return short
         search = _Search(tracks, self, rig, shutter)
         best, inliers = None, np.ones(len(tracks), dtype=np.bool_)
-        if len(tracks) > _LEAST:  # six fit always
+        if len(tracks) > _LEAST:  # six always fit
             report = ransac(search, self._options(), np.random.default_rng(0))
             if report.model is None:
                 return MotionEstimate.failed(f"{report.reason}; {_OPEN}")
@@ -313,11 +322,11 @@ class R6pSolver(Solver):
 
     @property
     def sides(self) -> tuple[Side, ...]:
-        """Sides of the cameras whose pixels count."""
+        """Sides of the cameras whose pixels are used."""
         return SIDES if self.cameras_used == "both" else ("left",)
 
     def beginning(self, tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
-        """Where R (3, 3) begins; at no rotation where P3P finds none."""
+        """Return the initial R (3, 3); it is the identity if P3P fails."""
         if self.start == "still":
             return np.eye(3)
         pose = P3pSolver(threshold_px=self.threshold_px, cameras_used="left").estimate(
@@ -326,7 +335,7 @@ class R6pSolver(Solver):
         return so3.exp(pose.w) if pose.success else np.eye(3)
 
     def _options(self) -> RansacOptions:
-        """The options of the search; checks the values."""
+        """Return the options of the search, which checks their values."""
         return RansacOptions(
             threshold=self.threshold_px,
             confidence=self.confidence,

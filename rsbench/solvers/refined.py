@@ -1,14 +1,16 @@
-"""Maximum likelihood: the exact rolling-shutter Sampson error, minimised over the six parameters of the motion.
+"""Maximum-likelihood solver: it minimises the exact rolling-shutter Sampson error over the six motion parameters.
 
-Samples of a robust search are three tracks, or five matches of one camera and all small rotations that they
-allow. To first order in w the exact constraint of the paper's motion is linear in d, with rows that are linear
-in w:
+Minimal samples of a robust search have three tracks or, without tracks, five matches of one camera, for which all
+solutions with a small rotation are found. To first order in w, the exact constraint of the paper's motion is
+linear
+in d, with coefficients that are linear in w:
 
     m(w) . d = 0,   m(w) = c + (a (x y^T - (x.y) I) - k1 [c]x) w,   c = x cross y, a = k3 - k1
 
-Five rows have a common null vector d when all ten 3 x 3 minors vanish: ten cubics in w with 20 monomials, solved
-by elimination and an action matrix. Without readout this is the linearised global-shutter five-point problem. The
-baseline is ignored, an error of |w| baseline / (2 |d|) that the refinement corrects.
+Five such rows have a common null vector d if all ten 3 x 3 minors vanish. These are ten cubic equations in w with
+20 monomials, solved by elimination and an action matrix. For a readout time of zero, this is the linearised
+global-shutter five-point problem. The baseline is ignored; the resulting relative error, |w| baseline / (2 |d|),
+is corrected by the refinement.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ _DEGREES = [
     *[(i, j, k) for i, j, k in itertools.product(range(4), repeat=3) if i + j + k == 3],
     *[(i, j, k) for total in (2, 1, 0) for i, j, k in itertools.product(range(3), repeat=3) if i + j + k == total],
 ]
-"""Exponents of the 20 monomials: ten cubic ones, six quadratic, three linear, one."""
+"""Exponents of the 20 monomials: ten cubic, six quadratic and three linear ones, and the constant."""
 _INDEX = {degrees: index for index, degrees in enumerate(_DEGREES)}
 _LINEAR = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
 
@@ -55,17 +57,17 @@ def _sum(*degrees: tuple[int, int, int]) -> int:
 
 
 _PRODUCT = np.array([[[_sum(a, b, c) for c in _LINEAR] for b in _LINEAR] for a in _LINEAR], dtype=np.int64)
-"""Monomial (4, 4, 4) of the product of three among 1, w1, w2, w3."""
+"""Index (4, 4, 4) of the monomial that is the product of three factors among 1, w1, w2, w3."""
 _TRIPLES = np.array(list(itertools.combinations(range(5), 3)), dtype=np.int64)
 _TIMES_W1 = [_sum(degrees, (1, 0, 0)) for degrees in _DEGREES[10:]]
 _UNIT = 0.1
-"""Radians: the elimination works on w / 0.1, of order one."""
+"""Unit of w in the elimination, radians, so that its values are of order one."""
 _MAX_ROTATION = 0.6
 
 
 @compiled
 def linear_rows(pairs: FloatArray, rows: FloatArray) -> None:
-    """Fill rows (n, 3, 4) of m(w), the constant part and the factors of w1, w2, w3, from pairs (n, 7)."""
+    """Fill rows (n, 3, 4): m(w) of pairs (n, 7), as constant part and coefficients of w1, w2, w3."""
     for n in range(len(pairs)):
         x, y, k1 = (pairs[n, 0], pairs[n, 1], 1.0), (pairs[n, 2], pairs[n, 3], 1.0), pairs[n, 4]
         a, c = pairs[n, 5] - k1, cross(x, y)
@@ -81,7 +83,7 @@ def linear_rows(pairs: FloatArray, rows: FloatArray) -> None:
 
 @compiled
 def _minors(rows: FloatArray, triples: IntArray, product: IntArray, out: FloatArray) -> None:
-    """Coefficients (10, 20) of the determinants of three rows each."""
+    """Add the coefficients (10, 20) of the determinants of all triples of rows to ``out``."""
     for t in range(10):
         for s in range(6):
             i, j, k = ((0, 1, 2), (1, 2, 0), (2, 0, 1), (0, 2, 1), (2, 1, 0), (1, 0, 2))[s]
@@ -94,7 +96,7 @@ def _minors(rows: FloatArray, triples: IntArray, product: IntArray, out: FloatAr
 
 
 def five_point(pairs: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """``(w, d)`` with a unit d of either sign, for every real small solution of pairs (5, 7) of one camera."""
+    """Return all real ``(w, d)`` with small w for pairs (5, 7) of one camera; d has length 1 and any sign."""
     rows = np.zeros((5, 3, 4))
     linear_rows(pairs, rows)
     scaled = rows * np.array([1.0, _UNIT, _UNIT, _UNIT])
@@ -127,33 +129,35 @@ _SCREEN_ITERATIONS, _SCREEN_MATCHES = 6, 150
 _LONGEST_START = 2.0
 """Largest initial length of d for pairs, in baselines."""
 _REWEIGHTINGS = (5, 5)
-"""Steps between estimates of the distribution of the errors."""
+"""Largest number of steps in each round of minimisation, after which the error distribution is re-estimated."""
 _LEAST_IN_FRONT = 0.75
 _AS_GOOD, _APART = 3.0, 25.0
-"""Standard deviations within which two motions fit equally well, and squared ones beyond which they are
-different."""
+"""Two motions fit equally well if their costs differ by less than the first, in standard deviations of the
+difference; they are different if their squared distance, normalised by its covariance, is above the second."""
 _NOISIER = 10.0
 """Ratio of the noise levels above which the motion with the larger one does not explain the matches."""
 _NEARLY_PLANAR = 0.15
-"""Largest share of the flow that a homography may leave unexplained for its motions to be tried; off a plane it is
-0.2 and more."""
+"""Largest residual of a homography, relative to the flow, for which its motions are tried as starts; for scenes
+that are not planar it is 0.2 and more."""
 LEAST_DEPTHS = 0.7
-"""Median disparity over its deviation below which equations that are linear in the point do not describe its
-error: in such problems half of the stated 95 % ellipsoids contained the truth."""
+"""Smallest ratio of the median disparity to its standard deviation for which a covariance is stated. Below it,
+errors of
+a point are not described by a linearisation: only half of the stated 95 % ellipsoids contained the truth."""
 NO_DEPTHS = "no deviation can be stated: disparities are smaller than their noise"
 _LEAST_NOISE_PX = 0.01
-"""Least noise in the test whether data determine a rotation, px: exact data have no residuals."""
+"""Lower bound of the noise, px, in tests of what data determine; exact data have no residuals."""
 
 
 @final
 @dataclass(frozen=True, kw_only=True)
 class RefinedSolver(Solver):
-    """Six-parameter descent on exact constraints, from several linear starts.
+    """Minimisation over all six parameters with exact constraints, from several linear solutions.
 
-    Matches over time contribute their Sampson error, tracks the whitened error of their stereo pairs, which is
-    the reprojection error of a bundle adjustment to first order and holds the metric scale. Starts: for
-    tracks no motion at all (the first step is the linear stereo pose-from-points solution); for pairs the iterated
-    linear solvers with 15, 11 and 9 unknowns and the eight-point algorithm. The sign of d comes from cheirality.
+    The cost has the Sampson error of matches over time, and the whitened error of tracks, which is to first order
+    the reprojection error of bundle adjustment and determines the metric scale. With tracks, the descent starts at
+    zero motion (the first step is the linear stereo pose-from-points solution). With pairs alone, it starts from
+    the iterated linear solvers with 15, 11 and 9 unknowns, the eight-point algorithm and the motions of a
+    homography; the sign of d comes from cheirality.
     """
 
     motion_model: str = "linear"
@@ -161,23 +165,23 @@ class RefinedSolver(Solver):
     motion_parameters: dict[str, Any] = field(default_factory=dict, hash=False)
     """Parameters of the motion model; absent ones have its defaults."""
     use_tracks: bool = True
-    """Off: tracks are used as unlinked left and right matches, for a fair comparison with solvers of pairs."""
+    """If false, tracks count as separate left and right matches, to compare fairly with solvers of pairs."""
     use_pairs: bool = True
-    """Off: uses only tracks, at least three."""
+    """If false, only tracks are used, at least three."""
     one_camera: bool = False
-    """Only the left camera's matches over time, and its own motion: d has no length."""
+    """Use only the left camera's matches over time and estimate its motion, with d up to scale."""
     shutter: Literal["rolling", "global"] = "rolling"
-    """Global: the same solver without readout, to measure the effect of the rolling shutter."""
+    """``global``: assume a readout time of zero, to measure the effect of the rolling shutter."""
     iterations: int = 60
-    """Steps of Levenberg and Marquardt, at most."""
+    """Largest number of Levenberg-Marquardt steps."""
     max_translation_m: float = 50.0
-    """Longest translation per frame period; pairs alone may not bound it."""
+    """Largest translation per frame period, metres; pairs alone may not bound it."""
     max_scale_sigma: float = 0.5
-    """Relative standard deviation of the length of d above which it is not metric."""
+    """Relative standard deviation of |d| above which an estimate from pairs is not metric."""
     max_direction_sigma: float = 0.5
-    """Standard deviation of the direction of d (radians) above which it is unknown."""
+    """Standard deviation of the direction of d (radians) above which it counts as unknown."""
     max_rotation_sigma: float = 0.2
-    """Standard deviation of the rotation (radians) above which there is no estimate."""
+    """Standard deviation of the rotation (radians) above which the estimate fails."""
 
     def __post_init__(self) -> None:
         load_kernel(self.motion_model, self.motion_parameters)
@@ -190,7 +194,7 @@ class RefinedSolver(Solver):
 
     @property
     def inner_keys(self) -> tuple[str, ...]:
-        """Components inside: another package's motion model."""
+        """Source version of the motion model if it belongs to another package."""
         model = motion_model(self.motion_model)
         return () if model.__module__.partition(".")[0] == "rsbench" else (source_version(model),)
 
@@ -213,7 +217,7 @@ class RefinedSolver(Solver):
         )
 
     def packed(self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter) -> Packed:
-        """The measurements that this solver uses, with the shutter that it assumes."""
+        """Pack the measurements that this solver uses, with the shutter that it assumes."""
         if self.shutter == "global":
             shutter = shutter.at_once()
         if not self.use_pairs:
@@ -243,7 +247,7 @@ class RefinedSolver(Solver):
         return self.report(packed, *self._settle(packed, best, rig))
 
     def sample_sizes(self, correspondences: Correspondences) -> dict[MatchSet, int]:
-        """Three tracks, else five matches of the camera that has more of them."""
+        """Return three tracks or, if there are fewer, five matches of the camera that has more of them."""
         if self.one_camera:
             return {"left": 5}
         if not self.use_pairs or (self.use_tracks and len(correspondences.tracks) >= 3):
@@ -301,7 +305,7 @@ class RefinedSolver(Solver):
         noise_px: float,
     ) -> MotionEstimate | None:
         if self.shutter == "global":
-            return None  # Its residuals of a rolling shutter's matches are no noise.
+            return None  # Its residuals are not just noise if the matches have a rolling shutter.
         packed = self.packed(correspondences, rig, shutter)
         theta = packed.theta(motion.w, motion.d)
         tailed = heavy_tailed(packed, theta, noise_px)
@@ -337,10 +341,10 @@ class RefinedSolver(Solver):
         return self._checked(packed, chosen.theta)
 
     def _checked(self, packed: Packed, theta: FloatArray) -> Minimum:
-        """Descent; if the points are then behind the cameras, another from the opposite translation."""
+        """Minimise from a start; if more points are in front for -d, minimise again from there."""
         if len(packed.tracks) > 0:
             return self._minimise(packed, theta, self.iterations)
-        # A start on fewer matches may have left the length of d at its limit, where the cost is flat.
+        # Screening with fewer matches may have left |d| at its limit, where the cost is flat.
         length, most = float(np.linalg.norm(theta[3:])), _LONGEST_START * packed.baseline
         start = np.concatenate([theta[:3], theta[3:] * (most / max(length, most))])
         best = self._minimise(packed, start, self.iterations)
@@ -350,7 +354,7 @@ class RefinedSolver(Solver):
         return best
 
     def _settle(self, packed: Packed, best: Minimum, rig: StereoRig) -> tuple[Minimum, bool]:
-        """The lowest minimum that pairs of a plane allow, and whether another one fits equally well."""
+        """Return the best minimum, also among those of a planar scene, and whether another fits equally well."""
         if len(packed.tracks) > 0:
             return best, False
         starts = [_signed_start(packed, packed.pairs, w, d, rig) for w, d in planar_motions(packed.larger_side())]
@@ -363,7 +367,10 @@ class RefinedSolver(Solver):
         return lowest, False
 
     def report(self, packed: Packed, best: Minimum, rival: bool = False) -> MotionEstimate:
-        """Estimate with covariance and what is not determined; ``rival``: another motion fits equally well."""
+        """Return the estimate with its covariance and with what the data leave undetermined.
+
+        ``rival``: whether another motion fits equally well.
+        """
         variance = packed.noise_variance(best.cost)
         if rotation_sigma(best.H, max(variance, _LEAST_NOISE_PX**2)) > self.max_rotation_sigma:
             return MotionEstimate.failed("the rotation is not determined: degenerate matches")
@@ -376,12 +383,12 @@ class RefinedSolver(Solver):
             d, covariance = _of_unit_length(d, covariance)
         scale_sigma, direction_sigma = _translation_sigmas(d, covariance)
         at_limit = float(np.linalg.norm(best.theta[3:])) >= 0.999 * self.max_translation_m
-        # Tracks give d in metres, however short it is; pairs give only its direction accurately.
+        # Tracks give d in metres even if it is short; pairs give only its direction accurately.
         linked = len(packed.tracks) > 0
         known = scale_sigma <= self.max_scale_sigma and not at_limit and not packed.one_camera
         metric = linked or known
-        # Without parallax, noise looks like translation, but half of the points come out behind the cameras.
-        # Tracks at negative disparities would also be explained by the opposite motion, beyond infinity.
+        # Without parallax, noise is fitted by a translation, but then half of the points are behind the cameras.
+        # Tracks with negative disparities (points beyond infinity) would be fitted by the opposite motion.
         disparity = _disparity(packed) if linked else 0.0
         in_front = (
             disparity >= 0.0 if linked else packed.in_front(best.theta) >= _LEAST_IN_FRONT * len(packed.pairs)
@@ -411,7 +418,7 @@ class RefinedSolver(Solver):
 
 
 def _disparity(packed: Packed) -> float:
-    """Median disparity of the tracks, px."""
+    """Return the median disparity of the tracks, px."""
     ends = packed.tracks
     return float(np.median(ends[:, 2] if ends.ndim == 2 else packed.focal[0] * (ends[:, 0, 0] - ends[:, 1, 0])))
 
@@ -422,8 +429,7 @@ def _finite(packed: Packed, thetas: Iterable[FloatArray]) -> list[MotionEstimate
 
 
 def _as_good(packed: Packed, best: Minimum, other: Minimum) -> bool:
-    """Whether the pairs do not prefer one of two motions, of which each has another component of the noise as
-    residual.
+    """Return whether the pairs do not prefer one of two motions significantly.
 
     Q. Vuong, Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 1989. His test is
     inconclusive if a few pairs cause nearly all of the difference; a motion with much more noise is then worse.
@@ -436,7 +442,7 @@ def _as_good(packed: Packed, best: Minimum, other: Minimum) -> bool:
 
 
 def rotation_sigma(H: FloatArray, variance: float) -> float:
-    """Standard deviation (radians) of the worst axis of the rotation, whatever the translation is."""
+    """Return the standard deviation (radians) of the rotation about its worst axis, with d marginalised."""
     H_dd = H[3:, 3:]
     values, vectors = np.linalg.eigh(H_dd)
     keep = values > 1e-12 * max(values[-1], 1e-300)
@@ -447,7 +453,7 @@ def rotation_sigma(H: FloatArray, variance: float) -> float:
 
 
 def _of_unit_length(d: FloatArray, covariance: FloatArray | None) -> tuple[FloatArray, FloatArray | None]:
-    """The direction of d, and the covariance (6, 6) of the rotation and of it."""
+    """Return the direction of d, and the covariance (6, 6) of rotation and direction."""
     length = max(float(np.linalg.norm(d)), 1e-300)
     u, P = d / length, np.eye(6)
     P[3:, 3:] = (np.eye(3) - np.outer(u, u)) / length
@@ -455,7 +461,7 @@ def _of_unit_length(d: FloatArray, covariance: FloatArray | None) -> tuple[Float
 
 
 def _translation_sigmas(d: FloatArray, covariance: FloatArray | None) -> tuple[float, float]:
-    """Relative standard deviation of the length of d, and of its direction in radians."""
+    """Return the relative standard deviation of |d|, and the standard deviation of its direction in radians."""
     length = float(np.linalg.norm(d))
     if covariance is None or length == 0.0:
         return np.inf, np.inf
@@ -465,7 +471,10 @@ def _translation_sigmas(d: FloatArray, covariance: FloatArray | None) -> tuple[f
 
 
 def linear_starts(packed: Packed, rig: StereoRig) -> list[FloatArray]:
-    """Starting parameters (6,) from the pairs: iterated linear solvers, then eight points of the left camera."""
+    """Return starting parameters (6,) from pairs.
+
+    They come from the iterated linear solvers, the eight-point algorithm for the left camera and a homography.
+    """
     step = max(1, len(packed.pairs) // (2 * _SCREEN_MATCHES))
     pairs = packed.pairs[::step]
     solutions = [solve_reduced(pairs, unknowns, 3) for unknowns in (15, 11, 9)]
@@ -482,10 +491,11 @@ def linear_starts(packed: Packed, rig: StereoRig) -> list[FloatArray]:
 
 
 def planar_motions(pairs: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """``(w, d)``, d of arbitrary length and sign, that the homography of pairs (n, 7) of one camera allows.
+    """Return the motions ``(w, d)``, with d up to scale and sign, from the homography of pairs (n, 7) of one
+    camera.
 
-    None when the pairs are far from being on a plane. On a plane every system of linear equations above loses
-    rank. O. Faugeras, F. Lustman, Motion and structure from motion in a piecewise planar environment, 1988.
+    The list is empty if the scene is far from planar. For a planar scene, the linear systems of the other starts
+    lose rank. O. Faugeras, F. Lustman, Motion and structure from motion in a piecewise planar environment, 1988.
     """
     if len(pairs) < 4:
         return []
@@ -508,7 +518,7 @@ def planar_motions(pairs: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def _signed_start(packed: Packed, pairs: FloatArray, w: FloatArray, d: FloatArray, rig: StereoRig) -> FloatArray:
-    """A direction with a plausible length (the paper's range of motions) and the sign of cheirality."""
+    """Return a start with a plausible length of d (the paper's range of motions) and its sign by cheirality."""
     scaled = scaled_translation(pairs, w, 10.0 * rig.baseline)
     length = 0.5 * rig.baseline
     if scaled is not None:
@@ -517,12 +527,13 @@ def _signed_start(packed: Packed, pairs: FloatArray, w: FloatArray, d: FloatArra
 
 
 def warm_up(motion_models: Iterable[str] = ("linear",)) -> None:
-    """Compile the code of the solvers of these motion models, or load it if it is compiled.
+    """Compile the solvers' code for these motion models, or load it from the cache on disk.
 
-    Call it before workers start, so that they find the code on disk, and in each of them before a clock starts.
+    Call this before starting workers, so that they find the code on disk, and in each worker before measuring
+    time. Nothing is compiled for a model without a kernel.
 
     Raises:
-        RsbenchError: there is no such motion model. For a model without a kernel, nothing is compiled.
+        RsbenchError: there is no such motion model.
     """
     rig = StereoRig(camera=PinholeCamera.centred(64, 64, 60.0), baseline=1.0)
     shutter = RollingShutter(height=64, readout_ratio=0.5)

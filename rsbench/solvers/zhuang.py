@@ -1,4 +1,4 @@
-"""The solvers of Zhuang et al.: differential ones of one rolling-shutter camera, and flow scaled to a global
+"""Solvers of Zhuang et al.: differential motion of one rolling-shutter camera, and flow scaled to a global
 shutter.
 
 B. Zhuang, L.-F. Cheong, G. H. Lee, Rolling-Shutter-Aware Differential SfM and Image Rectification, ICCV 2017.
@@ -7,18 +7,18 @@ A camera whose points move by ``dX/dtau = w x X + v`` shows, to first order in t
 
     u = beta P(x) (w x x + v / Z),   P(x) = [I | -x] (2, 3),   x the ray of frame 0,
 
-of which ``v . (x x u) + beta x^T s x = 0`` with ``s = (v w^T + w v^T) / 2 - (v . w) I`` is free of the depth:
-the differential epipolar constraint (Y. Ma, J. Kosecka, S. Sastry, IJCV 2000), linear in v and s. beta is the
-time that the flow took, in frame periods: tau1 - tau0 at constant velocity, and at constant acceleration k
+Eliminating the depth gives ``v . (x x u) + beta x^T s x = 0`` with ``s = (v w^T + w v^T) / 2 - (v . w) I``, the
+differential epipolar constraint (Y. Ma, J. Kosecka, S. Sastry, IJCV 2000), which is linear in v and s. beta is the
+duration of the flow in frame periods: tau1 - tau0 at constant velocity, and at constant acceleration k
 
     beta = (alpha + k alpha_k) 2 / (2 + k),   alpha = tau1 - tau0,   alpha_k = (tau1^2 - tau0^2) / 2.
 
-Then Z(k) = Z0 + k Z1 annihilates (v (2 + k) / 2, s), so that k is a generalised eigenvalue of nine matches
-(``ZhuangSolver``).
+Then (v (2 + k) / 2, s) is a null vector of Z(k) = Z0 + k Z1, so that for nine matches k is a generalised
+eigenvalue (``ZhuangSolver``).
 
-At constant velocity, a match that took ``a = 1 + h (y1 - y0)`` frame periods has moved a times as far as in
-one: scaling it by 1 / a makes any global-shutter solver one for a rolling shutter and a constant twist
-(``FlowScaledSolver``).
+At constant velocity, the flow of a match with a duration of ``a = 1 + h (y1 - y0)`` frame periods is a times as
+long as the flow in one period. If flows are scaled by 1 / a, any global-shutter solver can be used for a rolling
+shutter and a constant twist (``FlowScaledSolver``).
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ from rsbench.solvers.engine.base import (
 from rsbench.solvers.linear import ROUNDING, SYMMETRIC, rotation_from_essential, symmetric
 
 _SLOWEST, _FASTEST = -0.49, 3.0
-"""Accelerations k that are looked for: beyond the first the camera would turn back before the last row."""
+"""Range of accelerations k; with k at or below -0.5, the camera would stop and reverse before the last row."""
 _GRID = 29
 _K_STEPS = 8
 
 
 class Flow(NamedTuple):
-    """Flows (n, ...) of one camera."""
+    """Optical flow of n matches of one camera."""
 
     x: FloatArray
     """(n, 3) rays of frame 0, z = 1."""
     u: FloatArray
-    """(n, 3) what they move by, third 0."""
+    """(n, 3) changes of these rays from frame 0 to frame 1; the third component is 0."""
     alpha: FloatArray
-    """(n,) frame periods that they took."""
+    """(n,) durations tau1 - tau0, frame periods."""
     alpha_k: FloatArray
     """(n,) half the difference of the squared times."""
     focal: FloatArray
@@ -77,11 +77,11 @@ class Flow(NamedTuple):
         return cls(x, y - x, tau1 - tau0, 0.5 * (tau1**2 - tau0**2), focal)
 
     def beta(self, k: float) -> FloatArray:
-        """(n,) share of the motion of one frame period that each flow shows."""
+        """Return the fraction (n,) of the motion of one frame period that occurs during each flow."""
         return np.asarray((self.alpha + k * self.alpha_k) * (2.0 / (2.0 + k)))
 
     def system(self) -> tuple[FloatArray, FloatArray]:
-        """Z0 and Z1 (n, 9): columns of v and of the six entries of s."""
+        """Return Z0 and Z1 (n, 9), with columns for v and for the six entries of s."""
         x = self.x
         quadratic = [x[:, i] * x[:, j] * (1.0 if i == j else 2.0) for i, j in SYMMETRIC]
         q, c = np.stack(quadratic, axis=-1), so3.cross(x, self.u)
@@ -89,7 +89,7 @@ class Flow(NamedTuple):
 
 
 class Velocity(NamedTuple):
-    """w and v (3,), v of length 1, and k."""
+    """Angular velocity w (3,), linear velocity v (3,) of length 1, and acceleration k."""
 
     w: FloatArray
     v: FloatArray
@@ -97,9 +97,10 @@ class Velocity(NamedTuple):
 
 
 def null_vectors(Z: FloatArray) -> FloatArray:
-    """(..., 9) null vectors of systems (..., n, 9), n >= 8, in unit columns; NaN where there are more.
+    """Return null vectors (..., 9) of systems (..., n, 9), n >= 8, scaled to unit columns; NaN if not unique.
 
-    A translation along an axis without rotation leaves that axis's column zero, which is then the null vector.
+    For a translation along an axis without rotation, the column of that axis is zero, and the null vector is that
+    axis.
     """
     norms = np.linalg.norm(Z, axis=-2, keepdims=True)
     norms = np.where(norms > ROUNDING * np.max(norms, axis=-1, keepdims=True), norms, 1.0)
@@ -110,10 +111,10 @@ def null_vectors(Z: FloatArray) -> FloatArray:
 
 
 def accelerations(Z0: FloatArray, Z1: FloatArray) -> list[float]:
-    """Values of k at which Z0 + k Z1 (n, 9) has a null vector; of more than nine rows, nearly."""
+    """Return values of k for which Z0 + k Z1 (n, 9) has a null vector (nearly, if n > 9)."""
     if len(Z0) > 9:
         return _fitting_accelerations(Z0, Z1)
-    # v occurs without k: what is orthogonal to its columns leaves a square pencil of s.
+    # The columns of v do not depend on k. Projecting orthogonally to them leaves a square pencil for s.
     across = np.linalg.svd(Z0[:, :3])[0][:, 3:]
     P, P_k = across.T @ Z0[:, 3:], across.T @ Z1[:, 3:]
     values: Any = scipy.linalg.eig(P, -P_k, right=False)
@@ -122,7 +123,7 @@ def accelerations(Z0: FloatArray, Z1: FloatArray) -> list[float]:
 
 
 def _fitting_accelerations(Z0: FloatArray, Z1: FloatArray) -> list[float]:
-    """The k of the least smallest singular value, from a grid and then by turns for the null vector and for k."""
+    """Return the k that minimises the smallest singular value, from a grid search and Gauss-Newton steps."""
     norms = np.maximum(np.linalg.norm(Z0, axis=0), 1e-300)
     Z0, Z1, grid = Z0 / norms, Z1 / norms, np.linspace(_SLOWEST, _FASTEST, _GRID)
     M00, M01, M11 = Z0.T @ Z0, Z0.T @ Z1, Z1.T @ Z1
@@ -130,7 +131,7 @@ def _fitting_accelerations(Z0: FloatArray, Z1: FloatArray) -> list[float]:
     size = np.trace(M, axis1=1, axis2=2)
     k = float(grid[np.argmin(np.linalg.eigvalsh(M)[:, 0] / size)])
     for _ in range(_K_STEPS):
-        # Gauss and Newton's step: the other singular vectors take up what they can of the change with k.
+        # Gauss-Newton step, in which the other singular vectors absorb as much as possible of the change with k.
         U, s, Vt = np.linalg.svd(Z0 + k * Z1, full_matrices=False)
         change = Z1 @ Vt[-1]
         left = change - U[:, :-1] @ (U[:, :-1].T @ change)
@@ -140,7 +141,7 @@ def _fitting_accelerations(Z0: FloatArray, Z1: FloatArray) -> list[float]:
 
 
 def velocity_of(flow: Flow, e: FloatArray, k: float) -> Velocity | str:
-    """Velocity of a null vector (9,), its sign by the points in front; or why there is none."""
+    """Return the velocity from a null vector (9,), the sign of v by cheirality; or the reason of a failure."""
     if not np.all(np.isfinite(e)):
         return "the linear system has more than one solution: degenerate motion or scene"
     v = e[:3] * (2.0 / (2.0 + k))
@@ -153,7 +154,10 @@ def velocity_of(flow: Flow, e: FloatArray, k: float) -> Velocity | str:
 
 
 def _fields(flow: Flow, found: Velocity) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The flow without the rotation's, that of a translation at unit depth, and the rotation's (n, 2), px."""
+    """Return the derotated flow, the flow of the translation at unit depth, and the flow of the rotation.
+
+    They are (n, 2), px; the latter two are for one frame period.
+    """
     x = flow.x
 
     def seen(rate: FloatArray) -> FloatArray:
@@ -170,7 +174,7 @@ def _in_front(flow: Flow, found: Velocity) -> Velocity:
 
 
 def reprojection(flow: Flow, found: Velocity) -> tuple[FloatArray, FloatArray]:
-    """Errors (n,), px, of flows whose depths are the best for each, and their derivatives (n, 7) by w, v and k."""
+    """Return errors (n,), px, of flows at their best depths, and derivatives (n, 7) by w, v and k."""
     rest, moved, turned = _fields(flow, found)
     length = np.maximum(np.linalg.norm(moved, axis=1), 1e-300)[:, None]
     along = moved / length
@@ -189,7 +193,10 @@ def reprojection(flow: Flow, found: Velocity) -> tuple[FloatArray, FloatArray]:
 
 
 def refine(flow: Flow, start: Velocity, accelerated: bool) -> Velocity:
-    """Least squares of ``reprojection``, the paper's second stage; the start where the descent leaves it."""
+    """Minimise ``reprojection`` by least squares, the paper's second stage.
+
+    Return the start if there are too few matches, or the result is not finite or has k out of range.
+    """
     columns = 7 if accelerated else 6
 
     def velocity(p: FloatArray) -> Velocity:
@@ -217,18 +224,19 @@ def refine(flow: Flow, start: Velocity, accelerated: bool) -> Velocity:
 @final
 @dataclass(frozen=True, kw_only=True)
 class ZhuangSolver(Solver):
-    """Flow of the left camera as its velocity: eight matches at constant velocity, nine at constant acceleration.
+    """Differential motion of the left camera from eight matches (constant velocity) or nine (constant
+    acceleration).
 
-    The flow of a whole frame period counts as instantaneous: the rotation is off by the square of the motion, the
-    direction of translation by its first power. w and s are read from the null vector by least squares, which on
-    exact flows is what Ma's decomposition gives.
+    The flow during a whole frame period is treated as instantaneous; the resulting error of the rotation is of
+    second order in the motion, that of the direction of translation of first order. w is computed from v and s by
+    least squares, which for exact flows gives the same as Ma's decomposition.
     """
 
     acceleration: Literal["none", "constant"] = "none"
     """``none``: k is 0; ``constant``: k is estimated."""
     refinement: Literal["none", "reprojection"] = "reprojection"
-    """Refinement of the linear solution of more matches than a minimal sample has: least squares of the paper's
-    error of the flow, over all depths too."""
+    """``reprojection``: refine the linear solution by least squares of the paper's flow error, minimised over all
+    depths too; not used for minimal samples of RANSAC."""
 
     @property
     def spec(self) -> SolverSpec:
@@ -297,11 +305,12 @@ class ZhuangSolver(Solver):
         return self._reported(refine(flow, Velocity(motion.w, v / length, k), self._least == 9))
 
     def _linear(self, flow: Flow) -> tuple[list[Velocity], str]:
-        """Solutions of the linear system, and why there is none."""
+        """Return solutions of the linear system, and the reason if there are none."""
         Z0, Z1 = flow.system()
         if not (np.all(np.isfinite(Z0)) and np.all(np.isfinite(Z1))):
             return [], "matches too far away to compute with"
-        # Noise leaves half of the samples of nine no real k: without acceleration they still are near the motion.
+        # With noise, half of the samples of nine have no real k; their solution without acceleration is still
+        # useful.
         values = [0.0] if self._least == 8 else accelerations(Z0, Z1) or [0.0]
         found = [velocity_of(flow, null_vectors(Z0 + k * Z1), k) for k in values]
         good = [each for each in found if not isinstance(each, str)]
@@ -318,16 +327,18 @@ class ZhuangSolver(Solver):
 
 
 _LEAST_DURATION = 0.05
-"""Frame periods; a shorter one means a jump of nearly the whole image upwards, which no flow survives."""
+"""Smallest duration of a flow, frame periods; less means a jump upwards by nearly the whole image height."""
 
 
 def scale_flow(
     correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter, linked: bool = True
 ) -> Correspondences:
-    """Ideal matches whose frame-1 ends are moved to where they are after exactly one frame period.
+    """Return matches in ideal pixels with the ends of frame 1 moved to where they are after exactly one frame
+    period.
 
     Args:
-        linked: whether the ends of a left-right match that have two times are brought to the left camera's.
+        linked: whether ends of tracks in the right camera are moved to the time of the left camera's, if these
+            differ.
     """
     ideal = without_lens(correspondences, rig)
     halves = [
@@ -356,7 +367,7 @@ def _scaled(pixels: FloatArray, matches: FloatArray, side: Side, shutter: Rollin
 @final
 @dataclass(frozen=True, kw_only=True)
 class FlowScaledSolver(Solver):
-    """A global-shutter solver on scaled matches; its motion is that of a constant twist to first order."""
+    """A global-shutter solver applied to scaled matches, which is correct for a constant twist to first order."""
 
     solver: str
     """Name or card of the global-shutter solver."""
@@ -388,7 +399,7 @@ class FlowScaledSolver(Solver):
 
     @property
     def spec(self) -> SolverSpec:
-        """The spec of the inner solver, on a rolling shutter."""
+        """The spec of the inner solver, changed to a rolling shutter and a constant twist."""
         inner = self.inner.spec
         return replace(
             inner,

@@ -1,7 +1,7 @@
 """Files of a dataset: exact, deterministic bytes, written so that a killed run leaves no incomplete file.
 
-Hashes of files are stored, so that files with unchanged size and times are not read again. ``background_writer``
-writes on other threads.
+Hashes of files are stored, so that files with unchanged size and time stamps are not read again.
+``background_writer`` writes on other threads.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def check_out(out: Path) -> None:
-    """Refuse a folder of results that cannot be written, with RsbenchError, before minutes of work."""
+    """Raise RsbenchError if a folder of results cannot be written, before a long computation starts."""
     refuse_url(out)
     try:
         place = next(path for path in (out, *out.absolute().parents) if path.exists() or path.is_symlink())
@@ -88,7 +88,7 @@ _PNG_HEAD = 33
 
 
 def write_png(path: Path, image: NDArray[np.uint8], orientation: int = 1) -> None:
-    """8-bit image (H, W, 3) RGB or (H, W), with EXIF's orientation."""
+    """Write an 8-bit image (H, W, 3) RGB or (H, W) with an EXIF orientation."""
     import cv2  # here and below: a solve, which needs no OpenCV, imports this module
 
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
@@ -104,7 +104,7 @@ def write_png(path: Path, image: NDArray[np.uint8], orientation: int = 1) -> Non
 
 
 def read_png(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """RGB image (H, W, 3) uint8.
+    """Read an RGB image (H, W, 3) uint8.
 
     Args:
         path: of an image file.
@@ -130,14 +130,14 @@ def _decoded(path: Path, size: tuple[int, int] | None, mode: int) -> NDArray[Any
 
 
 def write_png16(path: Path, image: NDArray[np.uint16]) -> None:
-    """16-bit image (H, W)."""
+    """Write a 16-bit image (H, W)."""
     import cv2
 
     write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
 
 
 def read_grey_png(path: Path, size: tuple[int, int] | None = None, bits: Literal[8, 16] = 8) -> NDArray[Any]:
-    """Image (H, W) uint8 or uint16 of one channel; ``size`` as in ``read_png``.
+    """Read an image (H, W) uint8 or uint16 of one channel; ``size`` as in ``read_png``.
 
     Raises:
         RsbenchError: missing, not such an image, or of another size.
@@ -151,12 +151,12 @@ def read_grey_png(path: Path, size: tuple[int, int] | None = None, bits: Literal
 
 
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
-    """Grey PNG of 8 bits: 255 where the mask (H, W) is set, 0 elsewhere."""
+    """Write an 8-bit grey PNG: 255 where the mask (H, W) is set, 0 elsewhere."""
     write_png(path, np.where(mask, np.uint8(_SET), np.uint8(0)))
 
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
-    """Mask (H, W); ``size`` as in ``read_png``.
+    """Read a mask (H, W); ``size`` as in ``read_png``.
 
     Raises:
         RsbenchError: see ``read_grey_png``; or values other than 0 and 255.
@@ -168,12 +168,12 @@ def read_mask(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.boo
 
 
 def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
-    """float32 channel Z (H, W), metres, 0 = no surface; lossless ZIP."""
+    """Write depth (H, W), metres, 0 = no surface, as float32 channel Z with lossless ZIP compression."""
     write_exr(path, {"Z": depth})
 
 
 def write_exr(path: Path, channels: Mapping[str, NDArray[np.float32]], half: bool = False) -> None:
-    """float32 channels (H, W) by name, or float16 where ``half``; lossless ZIP."""
+    """Write channels (H, W) by name as float32, or float16 if ``half``, with lossless ZIP compression."""
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -186,7 +186,7 @@ def write_exr(path: Path, channels: Mapping[str, NDArray[np.float32]], half: boo
 
 
 def read_depth(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.float32]:
-    """Channel Z (H, W) float32, metres, 0 = no surface; ``size`` as in ``read_png``.
+    """Read channel Z (H, W) float32, metres, 0 = no surface; ``size`` as in ``read_png``.
 
     Raises:
         RsbenchError: see ``read_exr``; or negative or non-finite depth.
@@ -200,7 +200,7 @@ def read_depth(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.fl
 def read_exr(
     path: Path, names: tuple[str, ...], size: tuple[int, int] | None = None, half: bool = False
 ) -> NDArray[np.float32]:
-    """Channels (H, W, channels) float32 in the order of ``names``; ``size`` as in ``read_png``.
+    """Read channels (H, W, channels) float32 in the order of ``names``; ``size`` as in ``read_png``.
 
     Raises:
         RsbenchError: missing, damaged, of another size, or with other content than these channels in scanlines of
@@ -227,7 +227,7 @@ def read_exr(
 def _check_exr_header(
     headers: list[dict[str, Any]], path: Path, names: tuple[str, ...], size: tuple[int, int] | None
 ) -> None:
-    """Refuse unexpected parts, channels or sizes before pixels are decoded."""
+    """Raise an error for unexpected parts, channels or sizes before pixels are decoded."""
     import OpenEXR
 
     found = sorted(channel.name for header in headers for channel in header["channels"])
@@ -240,14 +240,14 @@ def _check_exr_header(
 
 
 def write_poses(path: Path, tau: FloatArray, poses: Pose) -> None:
-    """One line per row: tau and ``cam_from_world`` as unit quaternion and translation, exact decimal numbers."""
+    """Write a line per row: tau and ``cam_from_world`` as unit quaternion and translation, in exact decimals."""
     table = np.concatenate([tau[:, None], so3.quaternion(poses.R), poses.t], axis=1)
     lines = [f"{row}," + ",".join(repr(float(x)) for x in values) for row, values in enumerate(table)]
     write_bytes(path, ("\n".join([POSE_COLUMNS, *lines]) + "\n").encode())
 
 
 def read_poses(path: Path) -> tuple[FloatArray, Pose]:
-    """Row times (H,) and ``cam_from_world`` of every row.
+    """Read row times (H,) and ``cam_from_world`` of every row.
 
     Raises:
         RsbenchError: missing or not in the format of ``write_poses``.
@@ -257,7 +257,7 @@ def read_poses(path: Path) -> tuple[FloatArray, Pose]:
 
 
 def read_pose_table(path: Path) -> FloatArray:
-    """The numbers (H, 9) of a file of poses, in the order of ``POSE_COLUMNS``; RsbenchError as ``read_poses``."""
+    """Read the numbers (H, 9) of a file of poses, in the order of ``POSE_COLUMNS``; errors as ``read_poses``."""
     lines = read_text(path).splitlines()
     with naming(f"{path}: not a table of numbers"):
         table = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
@@ -269,19 +269,19 @@ def read_pose_table(path: Path) -> FloatArray:
 
 
 def save_matches(path: Path, matches: Correspondences) -> None:
-    """The sets of all matchers, and the rare ones if the matcher gives them."""
+    """Write the match sets ``MATCH_SETS``, and lines and affine frames if there are any."""
     rare = {name: rows for name in ("lines", "affine") if len(rows := getattr(matches, name))}
     save_arrays(path, {name: getattr(matches, name) for name in MATCH_SETS} | rare)
 
 
 def load_matches(path: Path) -> Correspondences:
-    """Matches of ``save_matches``; RsbenchError as ``load_arrays``, or for arrays that are not matches."""
+    """Read matches of ``save_matches``; errors as ``load_arrays``, or RsbenchError if arrays are no matches."""
     with naming(path, TypeError, ValueError):
         return Correspondences(**load_arrays(path))
 
 
 def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """Compressed npz, written atomically."""
+    """Write a compressed npz file atomically."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())
@@ -290,7 +290,7 @@ def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 def read_table(
     path: Path, columns: Iterable[str] = (), numbers: Iterable[str] = (), **options: Any
 ) -> pd.DataFrame:
-    """A CSV file; ``options`` are those of ``pandas.read_csv``.
+    """Read a CSV file; ``options`` are passed to ``pandas.read_csv``.
 
     Raises:
         RsbenchError: it cannot be read, is not a table, or lacks ``columns`` or numeric columns ``numbers``.
@@ -311,7 +311,7 @@ def read_table(
 
 
 def write_table(path: Path, frame: pd.DataFrame) -> None:
-    """CSV with six significant digits."""
+    """Write a CSV file with six significant digits."""
     write_bytes(path, frame.to_csv(index=False, float_format="%.6g", lineterminator="\n").encode())
 
 
@@ -356,7 +356,7 @@ class FileHashes:
         self._new: list[str] = []
 
     def of(self, name: str) -> HashedFile | None:
-        """A file by its path below the folder, with slashes; None if it is not a regular file."""
+        """Return the state and hash of a file, given its relative path with slashes; None if it is not regular."""
         path = f"{self._root}/{name}"
         try:
             found = os.stat(path)
@@ -371,7 +371,7 @@ class FileHashes:
         return known
 
     def sha256(self, path: Path) -> str:
-        """Hash of a file below the folder, by its path."""
+        """Return the hash of a file, given its path below the folder."""
         found = self.of(path.relative_to(self._root).as_posix())
         return sha256(path) if found is None else found.sha256
 
@@ -385,13 +385,13 @@ class FileHashes:
         self.append(self.taken())
 
     def taken(self) -> list[str]:
-        """New hashes as lines, for ``append`` in another process; they are removed here."""
+        """Return the new hashes as lines, for ``append`` in another process, and remove them here."""
         lines = self._new
         self._new = []
         return lines
 
     def append(self, lines: Sequence[str]) -> None:
-        """Keep lines of ``taken``."""
+        """Append lines from ``taken`` to the store."""
         self._known |= _parsed_hashes(lines)
         if lines:
             with self._store.open("a", encoding="utf-8", newline="\n") as stream:
@@ -406,7 +406,7 @@ class FileHashes:
 def _parsed_hashes(lines: Iterable[str]) -> dict[str, HashedFile]:
     known = dict[str, HashedFile]()
     for line in lines:
-        with contextlib.suppress(ValueError, TypeError, RecursionError):  # empty, cut, or of another origin
+        with contextlib.suppress(ValueError, TypeError, RecursionError):  # an empty, incomplete or foreign line
             name, size, modified, changed, digest = json.loads(line)
             known[name] = HashedFile(size, modified, changed, digest)
     return known
@@ -427,9 +427,9 @@ renderer."""
 
 @contextmanager
 def background_writer() -> Iterator[Later]:
-    """A function that runs work on other threads, such as writing during rendering; all is done at the end.
+    """Yield a function that runs work on other threads, such as writing files; at the end all work is complete.
 
-    The first error is raised at the end, or at a later call; results are those that the caller stores.
+    The first error is raised by a later call or at the end. Results are returned by the futures.
     """
     with ThreadPoolExecutor(_THREADS) as pool:
         jobs: deque[Future[Any]] = deque()
@@ -446,7 +446,7 @@ def background_writer() -> Iterator[Later]:
 
 
 def begun(later: Later, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Results of ``work`` for each item, in order; the first begin now, the others as results are taken."""
+    """Yield results of ``work`` for each item, in order; the first jobs start now, others as results are read."""
     rest = iter(items)
     waiting = deque(later(work, item) for item in islice(rest, _THREADS))
 

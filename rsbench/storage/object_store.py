@@ -47,7 +47,7 @@ class Listed(NamedTuple):
 
 
 def path_or_url(out: str) -> Path | str:
-    """A folder of this machine (also as ``file:///...``) or the URL of a store.
+    """Return a local folder (also given as ``file:///...``) or the URL of a store.
 
     Raises:
         RsbenchError: a URL that is not supported.
@@ -65,7 +65,7 @@ def path_or_url(out: str) -> Path | str:
 
 
 def shown(url: str) -> str:
-    """A URL for messages, without a password."""
+    """Return a URL without its password, for messages."""
     return re.sub(r"(?<=://)[^/@]*@", "", url)
 
 
@@ -88,7 +88,7 @@ class Store:
         self._root = root.rstrip("/")
 
     def listing(self, folder: str = "") -> dict[str, Listed]:
-        """All objects below a folder, by one listing."""
+        """Return all objects below a folder, from one listing."""
         top = f"{self._root}/{folder}".rstrip("/")
         with self._errors("list it"):
             self._fs.invalidate_cache()
@@ -102,7 +102,7 @@ class Store:
         }
 
     def read(self, paths: Iterable[str], at_once: int = 256) -> Iterator[tuple[str, bytes]]:
-        """Objects with their contents; ``at_once`` are requested together."""
+        """Yield objects with their contents; ``at_once`` of them are requested together."""
         paths = list(paths)
         for first in range(0, len(paths), at_once):
             some = {self._full(path): path for path in paths[first : first + at_once]}
@@ -141,7 +141,7 @@ class Store:
 
 @lru_cache(maxsize=4)
 def open_store(url: str) -> Store:
-    """The store of a URL, opened once in this process; see ``Store``."""
+    """Return the store of a URL, which is opened once per process; see ``Store``."""
     return Store(url)
 
 
@@ -165,7 +165,7 @@ def _remedy(error: Exception) -> str:
 
 
 def cache_of(url: str) -> Path:
-    """Local folder for the files and records of a store: in the user's cache, else a temporary folder.
+    """Return the local folder for files and records of a store: in the user's cache, else a temporary folder.
 
     Raises:
         RsbenchError: neither can be written.
@@ -179,7 +179,7 @@ def cache_of(url: str) -> Path:
 
 
 def key_of(url: str) -> str:
-    """A short name for the records of a store."""
+    """Return a short name for the records of a store."""
     return hashlib.sha256(url.encode()).hexdigest()[:16]
 
 
@@ -187,19 +187,19 @@ _BEAT_S = 30.0
 _BROUGHT = 64
 """Files of one download request."""
 _MARK = f"{HIDDEN}/{LOCK}"
-"""Makes the hidden folder one of rsbench's: empty at the store, where nothing can be locked."""
+"""Lock file, which marks a hidden folder as made by rsbench; empty in a store, which has no locks."""
 _OF_THIS_MACHINE = (_MARK, HASHES)
 _urls: dict[Path, str] = {}
 """URLs of the folders that are open in this process."""
 
 
 class _Known(NamedTuple):
-    """A file of the folder and its object, when they were last the same."""
+    """States of a local file and of its object when they were last equal."""
 
     here: str
-    """Time and size; empty: removed here, to be removed there."""
+    """Time and size of the file; empty: it was removed, and the object is to be removed."""
     there: str
-    """Size and token; empty: being sent."""
+    """Size and token of the object; empty: the upload is pending."""
 
 
 class _Mirror:
@@ -209,7 +209,7 @@ class _Mirror:
         self._known: dict[str, _Known] = {}
         try:
             self._known = {path: _Known(*known) for path, known in read_json(self._record).items()}
-        except (RsbenchError, TypeError):  # none yet, or damaged: the state of the folder is unknown
+        except (RsbenchError, TypeError):  # missing or damaged: the state of the folder is unknown
             remove(self.folder)
 
     def bring(self) -> None:
@@ -231,7 +231,7 @@ class _Mirror:
         if (self.folder / HIDDEN).is_dir():
             (self.folder / _MARK).touch()
         (self._work / LOCK).touch()
-        self._store.upload({_MARK: self._work / LOCK})  # before minutes of work: whether it can be written
+        self._store.upload({_MARK: self._work / LOCK})  # fails early if the store cannot be written
 
     def send(self) -> None:
         """Make the store equal to the folder; the pending changes are recorded first."""
@@ -243,10 +243,10 @@ class _Mirror:
         self._known |= {path: _Known(here[path], "") for path in due}
         self._known |= {path: _Known("", self._known[path].there) for path in gone}
         self._save()
-        self._remove(path for path in gone if not _is_hidden(path))  # old results must not be among new ones
+        self._remove(path for path in gone if not _is_hidden(path))  # outdated results must not mix with new ones
         for path in due:
             self._upload(path)
-        self._remove(path for path in gone if _is_hidden(path))  # the results that were made of it are there now
+        self._remove(path for path in gone if _is_hidden(path))  # results that depend on them are uploaded now
         there = self._there()
         self._known |= {path: _Known(here[path], there[path]) for path in due if path in there}
         for path in {*gone, *(path for path in due if path not in there)}:
@@ -254,7 +254,7 @@ class _Mirror:
         self._save()
 
     def keep_sending(self, done: threading.Event) -> None:
-        """Upload until ``done``; after an error it is tried again, and ``finish`` raises the last one."""
+        """Upload periodically until ``done``; after an error retry, and ``finish`` raises the last one."""
         while not done.wait(_BEAT_S):
             with contextlib.suppress(RsbenchError, OSError):
                 self.send()
@@ -270,7 +270,7 @@ class _Mirror:
             ) from error
 
     def _is_ahead(self, here: dict[str, str], there: dict[str, str]) -> bool:
-        """Whether neither others changed the store nor files here were removed since both were last equal."""
+        """Return whether, since both were equal, nobody else changed the store and no local files were removed."""
         return all(
             (known.there in ("", there.get(path)) or (not known.here and path not in there))
             and (not known.here or path in here)
@@ -282,7 +282,7 @@ class _Mirror:
         return known is not None and known.here == now and known.there != ""
 
     def _here(self) -> dict[str, str]:
-        """Time and size of each file of the folder, in the order of writing."""
+        """Return time and size of each file of the folder, in the order of writing."""
         found: list[tuple[int, bool, str, int]] = []
         for path in filter(_travels, files_below(self.folder)):
             state = (self.folder / path).lstat()
@@ -319,7 +319,7 @@ class _Mirror:
             self._store.remove(path)
 
     def _drop(self, path: str) -> None:
-        """Remove a file here, with the folders that are empty then: to a command they may be damaged results."""
+        """Remove a local file, and folders that become empty, since commands may take them for damaged results."""
         (self.folder / path).unlink()
         with contextlib.suppress(OSError):
             for parent in Path(path).parents[:-1]:
@@ -331,7 +331,7 @@ def _is_hidden(path: str) -> bool:
 
 
 def _travels(path: str) -> bool:
-    """Whether a file is uploaded: complete, not a lock, and with a name that is valid on every system."""
+    """Return whether a file is uploaded: it is complete, not a lock, and has a name that is valid everywhere."""
     *_, name = parts = path.split("/")
     own = path in _OF_THIS_MACHINE or path.startswith(f"{HIDDEN}/{WORK}/")
     plain = not {"", ".", ".."}.intersection(parts) and not re.search(r"[\\:]", path)
@@ -340,10 +340,10 @@ def _travels(path: str) -> bool:
 
 @contextmanager
 def mirrored(url: str) -> Iterator[Path]:
-    """A folder of this machine in which a command works as in any, with the results that the store has.
+    """Yield a local folder with the results of a store, in which a command works as usual.
 
-    Its files are uploaded while the command works and when it ends, also by an error. Other files in the store
-    stay as they are.
+    Its files are uploaded while the command runs and when it ends, even after an error. Other objects in the store
+    are not changed.
 
     Raises:
         RsbenchError: see ``Store`` and ``work_folder``; or the store refused results, which then stay in the
@@ -376,7 +376,7 @@ def mirrored(url: str) -> Iterator[Path]:
 
 @contextmanager
 def _called(folder: Path, url: str) -> Iterator[None]:
-    """Errors name the URL in place of the folder."""
+    """Replace the folder by the URL in error messages."""
     try:
         yield
     except RsbenchError as error:
@@ -385,7 +385,7 @@ def _called(folder: Path, url: str) -> Iterator[None]:
 
 
 def name_of(path: Path) -> str:
-    """The absolute path of a result, or its URL where it goes to a store."""
+    """Return the absolute path of a result, or its URL if it is uploaded to a store."""
     for folder, url in _urls.items():
         if path.is_relative_to(folder):
             return f"{url}/{path.relative_to(folder).as_posix()}"

@@ -49,7 +49,7 @@ _IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
 
 
 def check_amount(where: object, what: str, amount: int, limit: int) -> None:
-    """Refuse an amount above a limit.
+    """Raise RsbenchError if an amount exceeds a limit.
 
     Raises:
         RsbenchError: one line with the amount, the limit and the variable that raises it.
@@ -67,7 +67,7 @@ def _factor() -> float:
 
 
 def positive_variable(name: str, default: float, meaning: str) -> float:
-    """A positive number in an environment variable; RsbenchError, which ends with its meaning, for other text."""
+    """Read a positive number from an environment variable; RsbenchError, with its meaning, for other text."""
     text = os.environ.get(name) or str(default)
     with contextlib.suppress(ValueError):
         if math.isfinite(value := float(text)) and value > 0.0:
@@ -79,7 +79,7 @@ def positive_variable(name: str, default: float, meaning: str) -> float:
 
 
 def check_name(name: str) -> None:
-    """Refuse a name that cannot be that of a folder on every system, with ValueError."""
+    """Raise ValueError for a name that is not valid for a folder on every system."""
     if not NAME.fullmatch(name):
         raise ValueError(
             f"name = {name!r}: must be a folder's name: a letter or digit, then at most 119 letters, digits, "
@@ -90,7 +90,7 @@ def check_name(name: str) -> None:
 
 
 def inside(folder: Path, relative: str) -> Path:
-    """A file or folder below ``folder``, by a path from data.
+    """Return the file or folder at an untrusted path below ``folder``.
 
     Raises:
         RsbenchError: the path leads out of the folder, itself or through a link.
@@ -134,7 +134,7 @@ def _kind_of(mode: int) -> str:
 
 
 def read_bytes(path: Path, limit: int = FILE_BYTES) -> bytes:
-    """The content of a file of at most ``limit`` bytes.
+    """Read a file of at most ``limit`` bytes.
 
     Raises:
         RsbenchError: it cannot be read or is larger.
@@ -151,13 +151,13 @@ def read_bytes(path: Path, limit: int = FILE_BYTES) -> bytes:
 
 
 def sha256(path: Path) -> str:
-    """Hash of the bytes of a regular file."""
+    """Return the SHA-256 of a regular file."""
     with open_regular(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()  # pyrefly: ignore[bad-argument-type]
 
 
 def read_text(path: Path, limit: int = FILE_BYTES) -> str:
-    """The content of a file in UTF-8, with a byte order mark or without.
+    """Read a text file in UTF-8, with or without a byte order mark.
 
     Raises:
         RsbenchError: as ``read_bytes``, or another encoding, UTF-16 by its name.
@@ -172,7 +172,7 @@ def read_text(path: Path, limit: int = FILE_BYTES) -> str:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object.
+    """Read a JSON object from a file.
 
     Raises:
         RsbenchError: missing, unreadable, or not a JSON object.
@@ -181,7 +181,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def parse_json(text: str, where: object) -> dict[str, Any]:
-    """A JSON object in a text; errors as ``read_json``, with ``where`` in front."""
+    """Parse a JSON object; errors as ``read_json``, beginning with ``where``."""
     try:
         content = json.loads(text, object_pairs_hook=_keyed)
     except json.JSONDecodeError as error:
@@ -198,7 +198,7 @@ def parse_json(text: str, where: object) -> dict[str, Any]:
 
 
 def _keyed(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object; refuses two values for one key, with ValueError."""
+    """Return a JSON object; ValueError if a key is repeated."""
     found = dict(pairs)
     if len(found) < len(pairs):
         ((twice, _),) = Counter(key for key, _ in pairs).most_common(1)
@@ -207,7 +207,7 @@ def _keyed(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file.
+    """Read the arrays of an npz file.
 
     Raises:
         RsbenchError: it cannot be read, is damaged, holds objects, or more bytes than ``FILE_BYTES``.
@@ -220,7 +220,7 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def unpack_arrays(file: BinaryIO, where: object, limit: int = FILE_BYTES) -> dict[str, NDArray[Any]]:
-    """The arrays of an open npz file, ``limit`` bytes at most; errors as ``load_arrays``, with ``where`` in front.
+    """Read an open npz file, ``limit`` bytes at most; errors as ``load_arrays``, beginning with ``where``.
 
     zipfile reads at most the sizes that the directory of the archive states, whatever the data are.
     """
@@ -255,10 +255,10 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
 
 
 def check_image_size(data: bytes, where: object, size: tuple[int, int] | None = None, most: int = PIXELS) -> None:
-    """Refuse an image by its header: another size than ``size`` (width, height), or more than ``most`` pixels.
+    """Check the image size in the header: ``size`` (width, height), or at most ``most`` pixels if that is None.
 
     Raises:
-        RsbenchError: so, or not a PNG, JPEG, TIFF, BMP, WebP or PNM file.
+        RsbenchError: the size is wrong, or the file is not a PNG, JPEG, TIFF, BMP, WebP or PNM file.
     """
     from PIL import Image
 
@@ -276,7 +276,7 @@ def check_image_size(data: bytes, where: object, size: tuple[int, int] | None = 
 def check_size(
     where: object, found: tuple[int, int], size: tuple[int, int] | None = None, most: int = PIXELS
 ) -> None:
-    """Refuse a size (width, height) other than ``size``, or without that above ``most`` pixels (RsbenchError)."""
+    """Raise RsbenchError for a size (width, height) other than ``size``, or without it above ``most`` pixels."""
     if size is None:
         check_amount(where, f"{found[0]} x {found[1]} pixels", found[0] * found[1], most)
     elif found != size:

@@ -1,8 +1,8 @@
-"""Video files by FFmpeg through PyAV: frames as stored, with their times; files that phones play.
+"""Read and write video files with FFmpeg through PyAV; written files play on phones.
 
-A container says how its frames are to be turned for a person. They are read as they are stored, since turning an
-image turns its rows into columns, and rows are what a rolling shutter reads; the orientation goes beside them, as
-the number that EXIF gives it (1 to 8), and into what is written.
+A container states how its frames are rotated for display. Frames are read without this rotation, because a
+rotation by 90 degrees would turn the rows that a rolling shutter reads into columns. The orientation is returned
+separately, as an EXIF orientation (1 to 8), and is stored in the videos that are written.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MATRICES = {
     7: (0, -1, -1, 0),
     8: (0, -1, 1, 0),
 }
-"""a, b, c, d by EXIF's number: a stored pixel (x, y) is shown at (a x + c y, b x + d y), up to a shift."""
+"""a, b, c, d by EXIF orientation: a stored pixel (x, y) is shown at (a x + c y, b x + d y), up to a shift."""
 ORIENTATIONS = {
     2: "mirrored",
     3: "turned by 180 degrees",
@@ -50,18 +50,18 @@ ORIENTATIONS = {
 _CODECS = {".mp4": "libx264", ".m4v": "libx264", ".mov": "libx264", ".avi": "mjpeg", ".mkv": "ffv1"}
 """Codec by the file's suffix; FFV1 is lossless."""
 _OTHERS = {".webm", ".wmv", ".mpg", ".mpeg", ".flv", ".ogv", ".3gp", ".ts", ".mts", ".gif", ".hevc", ".h264"}
-"""Endings of videos that are not written."""
+"""Suffixes of video files that cannot be written."""
 SUFFIXES = frozenset(_CODECS)
 _QUALITY = {"libx264": {"crf": "17", "preset": "fast"}, "mjpeg": {"qmin": "2", "qmax": "2"}}
 _TAGS = ("color_range", "colorspace", "color_primaries", "color_trc")
 _FULL, _LIMITED = 2, 1
-"""FFmpeg's numbers of ranges of colour."""
+"""FFmpeg's identifiers of the colour ranges."""
 _LOSSLESS = {("u1", 2): "gray", ("u1", 3): "bgr0", ("u2", 2): "gray16le", ("u2", 3): "gbrp16le"}
-"""Pixel formats of FFV1 by what an image (H, W[, 3]) holds."""
+"""Pixel formats of FFV1 by the type and the number of dimensions of an image (H, W[, 3])."""
 _BRIGHT = 99.9
-"""Percentile of a 16-bit image that becomes white in 8 bits."""
+"""Percentile of the values of a 16-bit image that is mapped to white in 8 bits."""
 _BEFORE = 1.0
-"""Seconds of sound that may be written before the frames of that time."""
+"""Seconds by which the sound may be written ahead of the frames."""
 
 
 SIDEWAYS = tuple(number for number, matrix in _MATRICES.items() if matrix[0] == 0)
@@ -69,7 +69,7 @@ SIDEWAYS = tuple(number for number, matrix in _MATRICES.items() if matrix[0] == 
 
 
 def upright(image: Image, orientation: int) -> Image:
-    """A stored image (H, W[, C]) as it is shown."""
+    """Return a stored image (H, W[, C]) rotated for display."""
     a, b, c, d = _MATRICES[orientation]
     turned = np.swapaxes(image, 0, 1) if a == 0 else image
     across, down = (c, b) if a == 0 else (a, d)
@@ -77,10 +77,10 @@ def upright(image: Image, orientation: int) -> Image:
 
 
 def written_as_video(out: Path) -> bool:
-    """Whether the ending of a name is that of a video.
+    """Return whether the suffix of a path is one of ``SUFFIXES``.
 
     Raises:
-        RsbenchError: of one that is not written.
+        RsbenchError: the suffix is that of a video format that cannot be written.
     """
     suffix = out.suffix.lower()
     if suffix in _OTHERS:
@@ -91,22 +91,22 @@ def written_as_video(out: Path) -> bool:
 
 
 def said_fps(path: Path) -> float | None:
-    """Frames per second of a video file; None for a folder or where the file does not say."""
+    """Return the frame rate (1/s) of a video file; None for a folder, or if the file does not state it."""
     return VideoFile.open(path).rate if path.is_file() else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Times:
-    """The frames of a video by their time."""
+    """Time stamps of the frames of a video."""
 
     seconds: NDArray[np.float64]
-    """(n,) of each frame, increasing."""
+    """(n,) time of each frame, s, increasing."""
     stamps: tuple[int, ...]
-    """The same in units of ``base``."""
+    """The same times in units of ``base``."""
     base: Fraction
-    """Seconds."""
+    """Unit of ``stamps``, s."""
     nearly: NDArray[np.float32]
-    """(n,) mean difference, grey levels of 255, to the frame before; infinite of the first one."""
+    """(n,) mean absolute difference to the previous frame, 8-bit grey levels; infinite for the first frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,20 +118,20 @@ class VideoFile:
     height: int
     """Height of frames as they are stored, before rotation for display."""
     count: int
-    """Frames, as the file says; 0 where it does not."""
+    """Number of frames according to the file; 0 if it does not state it."""
     rate: float | None
-    """Mean frames per second as the file says."""
+    """Mean frame rate according to the file, 1/s."""
     orientation: int
     deep: bool
     """Whether it has more than 8 bits for each channel."""
     tags: tuple[int, ...]
-    """Range and space of its colours, FFmpeg's numbers in the order of ``_TAGS``."""
+    """Colour range and colour space, as FFmpeg's identifiers in the order of ``_TAGS``."""
     sound: str
-    """Codec of its sound; empty without."""
+    """Codec of the sound; empty if there is none."""
 
     @classmethod
     def open(cls, path: Path) -> VideoFile:
-        """Read what the container says, and one frame.
+        """Read the metadata of a video file, and its first frame.
 
         Raises:
             RsbenchError: it cannot be read as a video, or its frames are too large.
@@ -160,7 +160,7 @@ class VideoFile:
             )
 
     def frames(self) -> Iterator[Image]:
-        """Images (H, W, 3) RGB, or (H, W) grey, uint8, or uint16 of a deep video.
+        """Yield the images, (H, W, 3) RGB or (H, W) grey; uint16 if the video has more than 8 bits, else uint8.
 
         Raises:
             RsbenchError: a frame cannot be decoded, or has another size.
@@ -177,9 +177,9 @@ class VideoFile:
             yield frame.reformat(format=wanted, interpolation="BICUBIC").to_ndarray()
 
     def times(self) -> Times:
-        """Times of all frames, and how much each differs from the one before it; decodes all of them.
+        """Return the times of all frames and the difference of each to the previous one; decodes all frames.
 
-        Frames without a time, as some cameras write them, follow each other at the stated rate.
+        Some cameras write frames without increasing times; all times are then computed from the frame rate.
         """
         stamps, nearly, base, before = list[int | None](), list[float](), Fraction(1), None
         for frame in self._decoded():
@@ -215,7 +215,7 @@ class VideoFile:
 
 
 def _luma(frame: Any) -> NDArray[np.float32]:
-    """Every second pixel of a frame's luma, in grey levels of 255."""
+    """Return every second pixel of the luma of a frame in both directions, 8-bit grey levels."""
     grey = frame.reformat(format="gray").to_ndarray()
     return grey[::2, ::2].astype(np.float32)
 
@@ -244,7 +244,7 @@ def _words(error: Exception) -> str:
 
 
 def _orientation(frame: Any) -> int:
-    """EXIF's number of the frame's display matrix."""
+    """Return the EXIF orientation that is equal to the display matrix of a frame."""
     with suppress(KeyError, ValueError, TypeError):
         matrix = np.frombuffer(bytes(frame.side_data["DISPLAYMATRIX"]), np.int32)[[0, 1, 3, 4]]
         signs = tuple(int(each) for each in np.rint(matrix / 65536.0))
@@ -262,21 +262,21 @@ def write_frames(
     orientation: int = UPRIGHT,
     named: Path | None = None,
 ) -> tuple[int, list[str]]:
-    """Write images (H, W[, 3]) RGB or grey, uint8 or uint16, all of one size; returns how many, and notes.
+    """Write images (H, W[, 3]) RGB or grey, uint8 or uint16, all of one size; return their number and notes.
 
-    H.264 has 8 bits and even sizes: an odd size gets its last row or column twice. ``.mkv`` keeps all, ``.avi``
-    knows no orientation: its frames are turned.
+    H.264 supports 8 bits and even sizes only: for an odd size the last row or column is repeated. ``.mkv`` stores
+    images without loss. ``.avi`` cannot store an orientation, so its frames are rotated.
 
     Args:
-        out: ends in one of ``SUFFIXES``.
-        fps: frames per second, without ``times``.
-        times: of the frames.
-        like: the video whose sound and colours these get.
-        orientation: EXIF's number, for the container.
-        named: the file that errors and notes name; ``out`` if absent.
+        out: path with one of ``SUFFIXES``.
+        fps: frames per second, used if ``times`` is None.
+        times: time stamps of the frames.
+        like: the source video, whose sound and colour space are used.
+        orientation: EXIF orientation that is stored in the container.
+        named: the path in errors and notes; ``out`` if None.
 
     Raises:
-        RsbenchError: no frames, an encoder that this FFmpeg lacks, or a file that cannot be written.
+        RsbenchError: there are no frames, FFmpeg lacks the encoder, or the file cannot be written.
     """
     import av
 
@@ -345,7 +345,7 @@ def _stream(
 
 
 def _tag(target: Any, like: VideoFile | None) -> None:
-    """Colours as of the video read; of images, BT.601 in the limited range, in which they are encoded."""
+    """Set the colour tags to those of the source video, or for images to BT.601; the range is limited."""
     known = (_LIMITED, 5, 2, 2) if like is None else like.tags
     space = known[1] if known[1] in (1, 5, 6, 9) else 2
     for name, value in zip(_TAGS, (_LIMITED, space, *known[2:]), strict=True):
@@ -353,7 +353,8 @@ def _tag(target: Any, like: VideoFile | None) -> None:
 
 
 def _white(image: Image, like: VideoFile | None) -> float:
-    """Value that is white in 8 bits; of images of 16 bits, which may use few of them, that of the first one."""
+    """Return the value that is mapped to white in 8 bits: the type's maximum, or the ``_BRIGHT`` percentile of the
+    first image if 16-bit images may use only a part of their range."""
     if image.dtype == np.uint8 or (like is not None and like.deep):
         return float(np.iinfo(image.dtype).max)
     return max(float(np.percentile(image, _BRIGHT)), 1.0)
@@ -399,7 +400,7 @@ def _format_notes(out: Path, codec: str, image: Image, stream: Any) -> list[str]
 
 
 def _sound(container: Any, like: VideoFile | None, out: Path, notes: list[str]) -> Iterator[Any]:
-    """Packets of the sound of a video for another container, in order; none where it does not take them."""
+    """Return the sound packets of a video, in order; none if the new container does not support the codec."""
     if like is None or not like.sound:
         return iter(())
     source = _opened(like.path)

@@ -1,4 +1,4 @@
-"""Private folders of rsbench: in the user's cache, for temporary files, and the hidden one in a folder of results.
+"""Private folders of rsbench: the user's cache, temporary folders, and the hidden folder in a folder of results.
 
 ``.rsbench/lock`` is locked while a command works in a folder of results, and records its process and host.
 Results are written to ``.rsbench/work`` and renamed when complete. Everything in the hidden folder belongs to
@@ -39,13 +39,13 @@ def user_cache() -> Path | None:
         return Path(os.environ["XDG_CACHE_HOME"]) / "rsbench"
     if sys.platform == "win32" and os.environ.get("LOCALAPPDATA"):
         return Path(os.environ["LOCALAPPDATA"]) / "rsbench"
-    if not os.path.isabs(home):  # no HOME, and no entry of this user
+    if not os.path.isabs(home):  # no HOME, and the user is unknown
         return None
     return Path(home, "Library/Caches" if sys.platform == "darwin" else ".cache") / "rsbench"
 
 
 def temporary() -> Path | None:
-    """A temporary folder that only this user can write, since compiled code is loaded from it."""
+    """Return a temporary folder that only this user can write, because compiled code is loaded from it."""
     try:
         if sys.platform == "win32":
             return Path(tempfile.gettempdir()) / "rsbench"
@@ -60,7 +60,7 @@ def temporary() -> Path | None:
 
 
 def cpu_key() -> str:
-    """Identifies the CPU model: different machines may share a home folder."""
+    """Return a key of the CPU model, because different machines may share a home folder."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
         known = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
@@ -78,7 +78,7 @@ LOCK = "lock"
 _BEAT_S = 15.0
 _TRIES = 100
 _DEAD_S = 90.0
-"""Age of the owner's record after which its process is taken as dead; NFS shows changes up to 60 s late."""
+"""Age of the owner's record, s, above which its process counts as ended; NFS may delay changes by 60 s."""
 
 
 @contextmanager
@@ -108,7 +108,7 @@ def work_folder(out: Path, hidden: Path | None = None) -> Iterator[Path]:
 
 
 def refuse_url(out: Path) -> None:
-    """Refuse a URL that was turned into a path, with RsbenchError."""
+    """Raise RsbenchError if a path is a converted URL."""
     if re.match(r"[a-z][a-z0-9+.-]+:/", out.as_posix()):
         url = out.as_posix().replace(":/", "://", 1)
         raise RsbenchError(f"{url}: is a URL, which this command does not take there; give a folder")
@@ -123,7 +123,7 @@ def remove(path: Path) -> None:
 
 
 def unknown_files(folder: Path, ours: Callable[[str], bool]) -> list[str]:
-    """Paths below a folder that are not regular files of rsbench, sorted; relative, with slashes.
+    """Return the relative paths below a folder that are not regular files of rsbench, sorted, with slashes.
 
     A link is always unknown; an empty folder is not listed.
     """
@@ -139,7 +139,7 @@ def unknown_files(folder: Path, ours: Callable[[str], bool]) -> list[str]:
 
 
 def listed(folder: Path, suffix: str = "") -> list[Path]:
-    """Content of a folder with this suffix, sorted; empty for a missing folder.
+    """Return the content of a folder with this suffix, sorted; empty if the folder is missing.
 
     Raises:
         OSError: the folder cannot be listed, which ``Path.glob`` would ignore.
@@ -151,7 +151,7 @@ def listed(folder: Path, suffix: str = "") -> list[Path]:
 
 
 def files_below(folder: Path) -> list[str]:
-    """Paths of all files below a folder, relative to it, with slashes, sorted.
+    """Return the relative paths of all files below a folder, with slashes, sorted.
 
     Raises:
         OSError: a folder cannot be listed, which ``Path.rglob`` would ignore.
@@ -166,7 +166,7 @@ def _raise(error: OSError) -> NoReturn:
 
 
 def named(paths: list[str], most: int = 3) -> str:
-    """The first paths as text, and the number of the others."""
+    """Format the first paths as text, with the number of the others."""
     more = f" and {len(paths) - most} more" if len(paths) > most else ""
     return ", ".join(paths[:most]) + more
 

@@ -1,4 +1,4 @@
-"""Verification of a dataset: every file is what the manifests say, and every channel agrees with the others."""
+"""Verify a dataset: every file must match the manifests, and every channel must agree with the others."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 MOST_FAULTS = 1000
-"""Faults of one sequence that are reported one by one: its manifests may list any number of files."""
+"""Number of faults of one sequence that are reported one by one: its manifests may list any number of files."""
 
 
 def verify_dataset(
@@ -45,24 +45,24 @@ def verify_dataset(
     scenes: Collection[Path] = (),
     workers: int = 1,
 ) -> list[SequenceReport]:
-    """Check every sequence of a dataset; faults are values, only an unreadable dataset raises.
+    """Check every sequence of a dataset; faults are returned, only an unreadable dataset raises an error.
 
     Args:
-        folder: holds dataset.json.
+        folder: the folder of dataset.json.
         stride: compare every ``stride``-th pixel in both directions.
-        progress: see ``Progress``; there are ``verification_steps`` in all.
-        rerender: rows to render again where the scene can be built here.
-        scenes: cards of scenes that are not rsbench's own, and mesh files of objects that move.
-        workers: processes that check a sequence each; 1 is this one, with all its threads.
+        progress: see ``Progress``; there are ``verification_steps`` calls in all.
+        rerender: which rows to render again if the scene can be built here.
+        scenes: cards of scenes that are not built in, and mesh files of moving objects.
+        workers: number of processes that check one sequence each; 1: this process, with all its threads.
 
     Returns:
-        One report per sequence; before them one named dataset.json where that has faults of its own, and one for
-        each of the first ``MOST_MISSING`` sequences that have no folder or an empty one.
+        One report per sequence, after one named dataset.json if that file has faults, and one for each of the
+        first ``MOST_MISSING`` sequences whose folder is missing or empty.
 
     Raises:
-        ValueError: ``stride``, ``rerender`` or ``workers`` is none of the allowed.
+        ValueError: ``stride``, ``rerender`` or ``workers`` has a value that is not allowed.
         LostJobsError: the process of a sequence ended each time it was tried.
-        RsbenchError: no dataset.json, or one that is not a JSON object; no card of a scene where one was named.
+        RsbenchError: dataset.json is missing or not a JSON object, or a scene card that was named does not exist.
     """
     arguments.check_whole("stride", stride, 1, arguments.LARGEST_SIZE)
     arguments.check_one_of("rerender", rerender, ("no", "auto", "all"))
@@ -97,7 +97,7 @@ def _checker(
     files: Sequence[Path],
     step: Progress = lambda name: None,
 ) -> Callable[[str], SequenceReport]:
-    """A function that checks the sequence of a name; it keeps the scene of the last one."""
+    """Return a function that checks the sequence of a given name; it keeps the scene of the last one."""
     listing = manifest_checks.Listing.of(folder, read_json(folder / manifest_checks.DATASET))
     again = None if rerender == "no" else Rerenderer(rerender, cards, files)
     return lambda name: verify_sequence(listing, name, stride, step, again)
@@ -106,7 +106,7 @@ def _checker(
 def _reports_apart(
     names: list[str], workers: int, folder: Path, stride: int, rerender: Rerender, *named: list[Path]
 ) -> Iterator[SequenceReport]:
-    """Reports of sequences as they are ready, from processes that share the cores; ``named`` as ``_checker``."""
+    """Yield reports as they become ready, from processes that share the cores; ``named`` as for ``_checker``."""
     threads = max(1, (os.cpu_count() or 1) // workers)
     environment = dict.fromkeys(THREAD_VARIABLES, "1") if threads == 1 else {}
     given = threads, folder, stride, rerender, *named
@@ -123,7 +123,7 @@ def _reports_apart(
 def _serve(
     threads: int, folder: Path, stride: int, rerender: Rerender, cards: list[Path], files: list[Path]
 ) -> Callable[[str], dict[str, Any]]:
-    """``_checker`` in a child process, whose reports are tables."""
+    """Return ``_checker`` for a child process, with its reports as dictionaries."""
     set_threads(threads)
     if threads == 1:
         use_one_thread()
@@ -136,13 +136,13 @@ def _serve(
 
 
 def verification_steps(manifest: Mapping[str, Any]) -> int:
-    """How often ``verify_dataset`` reports progress on the dataset of this dataset.json."""
+    """Return how often ``verify_dataset`` reports progress on a dataset with this dataset.json."""
     listing = manifest_checks.Listing.of(Path(), manifest)
     return _steps(listing) * len(listing.names)
 
 
 def _steps(listing: manifest_checks.Listing) -> int:
-    """Progress reports of each sequence."""
+    """Return the number of progress reports of each sequence."""
     frames = len(FRAMES) if isinstance(listing.card, Finding) else listing.card.frames
     return 1 + STEPS * (frames - 1)
 
@@ -154,7 +154,7 @@ def verify_sequence(
     step: Progress = lambda name: None,
     again: Rerenderer | None = None,
 ) -> SequenceReport:
-    """Check one sequence of a dataset; the rest as of ``verify_dataset``."""
+    """Check one sequence of a dataset; ``stride`` as in ``verify_dataset``; ``again`` renders rows again."""
     steps = _steps(listing)
 
     def counted(sequence: str) -> None:

@@ -1,4 +1,4 @@
-"""Channels with a value for each pixel, against depth, motion and each other: every value is derived again."""
+"""Check channels with a value for each pixel against depth, motion and each other: each value is derived again."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ if TYPE_CHECKING:
 
 Float32Array = NDArray[np.float32]
 _FEW, _OF_A_ROW = 1e-3, 0.25
-"""Shares of pixels that may differ: in the image, those at its borders that rounding moves across; in a row."""
+"""Shares of pixels that may differ, in the image and in a row: rounding moves pixels across the image border."""
 _SURFACE, _BEHIND = 5e-5, 3e-4
-"""Relative distance below which a pixel sees the target's surface, and beyond which it is behind it."""
+"""Relative depth difference below which a point lies on the target's surface, and above which that hides it."""
 _FEW_THIN, _FEW_GAPS, _FEW_SHOWN = 0.01, 0.3, 3e-3
-"""Shares of the pixels on flat surfaces of the target, behind them, and in view: what is thinner than a
-pixel hides points between the target's pixels, or shows them. Where little is hidden, such as joints between tiles
-may be most of it."""
+"""Largest shares of wrong pixels among those on flat surfaces of the target, behind them, and in view. Structures
+thinner than a pixel hide points between the target's pixels, and thin gaps reveal them; where little is hidden,
+such gaps, for instance the joints between tiles, may be most of it."""
 _OF_A_THIN_ROW, _OF_ITS_WIDTH = 0.5, 0.125
-"""Such things may lie along a row: shares of its pixels that are reported, and of all its pixels."""
+"""The same in one row, along which a thin structure may lie: of its pixels of that kind, and of its width."""
 _FEW_AGAIN = 5e-3
-"""Share of the pixels of rows made again that may differ: on another processor, rounding of depth moves points
-across edges now and then."""
+"""Share of pixels that may differ in rows that are computed again: on another processor, the rounding of depth
+sometimes moves points across edges."""
 _LEAST = 8
 """Number of pixels that may always differ."""
 _EXPLAINS = 0.8
@@ -68,21 +68,21 @@ class _Stored(NamedTuple):
 
 
 class _Derived(NamedTuple):
-    """A channel as depth and motion make it, every ``stride``-th pixel."""
+    """A channel computed from depth and motion, at every ``stride``-th pixel."""
 
     values: Float32Array
     """(h, w, components) px, NaN out of view."""
     hidden: Float32Array
-    """(h, w) 1 where a flat surface of the target hides it, 0 where it is that surface, NaN where it is unsure."""
+    """(h, w) 1 where a flat surface of the target hides the point, 0 where it contains it, NaN if unclear."""
 
 
 def channel_faults(
     content: Content, reported: Collection[str], new: tuple[int, ...], stride: int = 1
 ) -> Iterator[Finding]:
-    """What the channels of a sequence show that its depth maps and motion cannot have made.
+    """Find values of the channels between two pictures that do not follow from the depth maps and the motion.
 
-    Files that are ``reported`` already, missing or wrong, are left out; a wrong depth map would accuse others. Of
-    channels between two frames of the content, or within one, at least one of which is ``new``.
+    Missing or wrong files that are ``reported`` already are left out, as a wrong depth map would accuse others.
+    Only channels whose frames are all in the content, and at least one of them ``new``, are checked.
     """
     sequence, maps, times = content.sequence, content.maps_without(reported), content.times
     for layer in pair_layers(sequence.channels, sequence.twins, sequence.frames):
@@ -101,7 +101,7 @@ def channel_faults(
 
 
 def _stored(sequence: Sequence, layer: Layer, view: ImageView) -> _Stored:
-    """Raises RsbenchError where a file cannot be read."""
+    """Read the values and classes of a view; RsbenchError if a file cannot be read."""
     channel, row, back = layer
     where = channel, view.side, view.frame, row, back
     return _Stored(sequence.offsets(*where), sequence.classes(*where))
@@ -110,14 +110,14 @@ def _stored(sequence: Sequence, layer: Layer, view: ImageView) -> _Stored:
 def channels_again(
     sequence: Sequence, view: ImageView, rows: list[int], frame: Frame, rays: Rays, reported: Collection[str]
 ) -> Iterator[Again]:
-    """Make rows of the channels of a frame again, and compare each file.
+    """Compute rows of the channels of a frame again, and compare them with each file.
 
     Args:
-        sequence: holds them.
-        view: the frame; a global-shutter one has no channels.
-        rows: of the frame.
-        frame: these rows rendered again.
-        rays: through the scene.
+        sequence: the sequence with the stored channels.
+        view: the frame; a global-shutter frame has no channels.
+        rows: numbers of the rows.
+        frame: these rows, rendered again.
+        rays: ray casting in the scene.
         reported: files that are not compared.
     """
     if view.shutter != "rs":
@@ -198,7 +198,7 @@ def _mask_faults(
 
 
 def _derived(content: Content, layer: Layer, view: ImageView, stride: int) -> _Derived:
-    """Sky is a surface at ``FAR``; what has none in the target is before it nowhere."""
+    """Derive a channel from depth and motion; sky counts as a surface at ``FAR``, hidden by any other."""
     sequence, maps = content.sequence, content.maps
     depth = maps[view].depth
     filled = replace(maps[view], depth=np.where(depth > 0, depth, np.float32(FAR)))
@@ -214,7 +214,7 @@ def _derived(content: Content, layer: Layer, view: ImageView, stride: int) -> _D
 def _many(
     wrong: BoolArray, among: BoolArray, few: float = _FEW, of_a_row: float = _OF_A_ROW, of_its_width: float = 0.0
 ) -> bool:
-    """Whether too many pixels (H, W) are wrong among these, in the image or in one of its rows."""
+    """Return whether too many of the pixels ``among`` (H, W) are wrong, in the image or in one of its rows."""
     in_row, of_row = np.sum(wrong, axis=1), np.sum(among, axis=1)
     rows = np.any(in_row > np.maximum(of_a_row * of_row, max(_LEAST, of_its_width * wrong.shape[1])))
     return bool(np.sum(wrong) > max(few * np.sum(among), _LEAST) or rows)
@@ -225,14 +225,14 @@ def _many_thin(wrong: BoolArray, among: BoolArray) -> bool:
 
 
 def _many_gaps(in_view: BoolArray, wrong: BoolArray, behind: BoolArray) -> bool:
-    """Too many for what is hidden, and for what is ``in_view`` (H, W)."""
+    """Return whether too many pixels are wrong, both of those ``behind`` and of those ``in_view`` (H, W)."""
     of_hidden = _many(wrong, behind, _FEW_GAPS, _OF_A_THIN_ROW, _OF_ITS_WIDTH)
     few = _or_a_line(_FEW_SHOWN, in_view)
     return of_hidden and _many(wrong, in_view, few, _OF_A_THIN_ROW, _OF_ITS_WIDTH)
 
 
 def _or_a_line(few: float, among: BoolArray) -> float:
-    """A share of these pixels, at least that of one joint from end to end of the picture."""
+    """Return ``few``, or, if larger, the share of these pixels that one joint across the whole picture has."""
     return max(few, max(among.shape) / max(1, int(np.sum(among))))
 
 
@@ -245,7 +245,7 @@ def _percent(wrong: BoolArray, among: BoolArray) -> str:
 def _pair_cause(
     layer: Layer, view: ImageView, stored: Mapping[ImageView, _Stored], derived: _Derived, stride: int
 ) -> str:
-    """What the stored values are instead, in words; "" where nothing explains most of them."""
+    """Describe how the stored values seem to have been changed; "" if no change explains most of them."""
     values = stored[view].values
     sampled = values[::stride, ::stride]
     tried = {
@@ -275,19 +275,19 @@ def _explains(candidate: Float32Array, derived: _Derived) -> bool:
 
 
 _UNIT = 1e-5
-"""Tolerance of a length: the rounding of float32."""
+"""Tolerance of the length of a normal: the rounding of float32."""
 LEVEL, FEW_BENT = 0.05, 0.02
-"""Cosine between a normal and its surface, which bends by less where it counts as flat; and the share of flat
-pixels that may be beyond, at creases of less than that."""
+"""Largest cosine between a normal and a step along its surface, as flat surfaces bend by less; share of flat
+pixels that may exceed it, at shallow creases."""
 _FEW_OTHERS = 0.02
-"""Share of the pixels of one surface that may show another instance: what is thinner than a pixel may lie between
-four that see something else."""
+"""Share of the pixels of one surface that may show another instance: an object thinner than a pixel may lie
+between four pixels that see something else."""
 
 
 def surface_faults(content: Content, reported: Collection[str], new: tuple[int, ...]) -> Iterator[Finding]:
-    """What normals and instances show that the surfaces of the depth maps are not, but for files ``reported``.
+    """Find normals and instances that contradict the surfaces of the depth maps, except in ``reported`` files.
 
-    Of frames that are ``new``, and of pairs with one that is.
+    Only ``new`` frames are checked, and pairs of frames of which at least one is new.
     """
     sequence, maps = content.sequence, content.maps_without(reported)
     instances: dict[ImageView, NDArray[np.uint16]] = {}
@@ -341,8 +341,8 @@ def _normal_faults(
 def _resting(
     sequence: Sequence, depth_map: DepthMap, normals: NDArray[np.float32]
 ) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
-    """Points, rays to them and normals, (H, W, 3) each, in the world; of a moving object in the frame in which it
-    rests: the normals of a picture belong to the times of its rows."""
+    """Return points, rays to them and normals, (H, W, 3) each, in the world frame; those of a moving object in its
+    own frame, in which it is at rest, as the normals of a picture belong to the times of its rows."""
     surfaces = SeenSurfaces(sequence, depth_map.view, depth_map.depth)
     X, rays, labels = surfaces.points, surfaces.points - surfaces.eyes, depth_map.labels
     for number, thing in enumerate(sequence.objects, start=1):
@@ -375,7 +375,7 @@ def _agreement_faults(
     reprojection = reproject(content.sequence, content.maps[view], content.maps[partner])
     with np.errstate(invalid="ignore"):
         same = np.abs(reprojection.relative) < _SURFACE
-    # One of the four pixels around must see the same: between them, things that touch change.
+    # One of the four surrounding pixels must show the same instance: touching objects may meet between them.
     there = around(instances[partner], reprojection.pixels[same], (0, 1))
     other = np.zeros(same.shape, dtype=np.bool_)
     other[same] = ~np.any(there == instances[view][same], axis=0)
@@ -386,11 +386,11 @@ def _agreement_faults(
 
 
 _CODE = 0.54
-"""Codes by which light may differ from a code: its rounding, and that of half floats by 2^-12 of a value."""
+"""Tolerance of linear light in codes: the rounding of the codes, and that of half floats, 2^-12 of a value."""
 
 
 def hdr_faults(content: Content, reported: Collection[str]) -> Iterator[Finding]:
-    """What linear images show otherwise than the clean images, but for files ``reported``."""
+    """Find linear images that do not match the clean images, except in ``reported`` files."""
     sequence = content.sequence
     renderer = sequence.manifest.get("renderer")
     exposure = renderer.get("exposure") if isinstance(renderer, dict) else None
@@ -416,7 +416,7 @@ def hdr_faults(content: Content, reported: Collection[str]) -> Iterator[Finding]
 
 
 def _radiance_cause(light: NDArray[np.float32], picture: Picture) -> str:
-    """What linear values (H, W, 3) are instead, in words; "" where nothing explains most of them."""
+    """Describe how linear values (H, W, 3) seem to have been changed; "" if no change explains most of them."""
     wanted = linear_of_codes(picture.colours)
     open_ = (wanted > 0.02) & (wanted < 0.98)
     if not np.any(light):

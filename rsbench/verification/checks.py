@@ -1,4 +1,4 @@
-"""The checks of ``rsbench verify``: their table, one function and one row each, and their run over a sequence."""
+"""The checks of ``rsbench verify``: a table with a row and a function for each, and their run over a sequence."""
 
 from __future__ import annotations
 
@@ -59,15 +59,15 @@ class State:
     missing: Collection[str] = ()
     """Files that a manifest lists but that are missing."""
     sequence: Sequence = field(init=False)
-    """From the stage "sequence" on, as ``other_images``."""
+    """Available from the stage "sequence" on, like ``other_images``."""
     other_images: OtherImages = field(init=False)
     """Images with which its own may have been exchanged."""
     fresh: Content = field(init=False)
-    """The frames that were read last: the first two together, then one at a time. From the stage "masks" on."""
+    """The frames that were read last: first two together, then one by one. Available from stage "masks" on."""
     twins: Content = field(init=False)
     """Their global-shutter twins at other rows than the first."""
     content: Content = field(init=False)
-    """The last two frames, without files that earlier checks found wrong. From the stage "frames" on."""
+    """The last two frames, without files that earlier checks found wrong. Available from the stage "frames" on."""
     masks_by_rays: bool = False
     """Whether the masks of ``fresh`` and ``twins`` come from traced rays, not from files."""
     rerendered: RerenderedRows | None = None
@@ -105,7 +105,7 @@ class State:
 
 
 def picture_faults(state: State) -> Iterator[Finding]:
-    """Faults in depth maps and images of two successive frames that the others contradict."""
+    """Find depth maps and images of two successive frames that the others contradict."""
     content, again = state.content, state.again
     comparison = Comparison(content, state.stride)
     for agreement in comparison.pairs():
@@ -126,7 +126,7 @@ def picture_faults(state: State) -> Iterator[Finding]:
 
 
 def geometry_faults(state: State) -> Iterator[Finding]:
-    """Faults of sequence.json, or of single frames, from the frames that disagree."""
+    """Find faults of sequence.json, or of single frames, from the frames that disagree."""
     if not state.disagreeing:
         return
     first = min(state.disagreeing.values(), key=lambda each: (each.over_time, each.share))
@@ -156,7 +156,7 @@ class Check:
     """Further findings after all frames."""
 
     def found(self, findings: Iterable[Finding]) -> Iterator[Finding]:
-        """Findings with the name of the check."""
+        """Return the findings with the name of the check."""
         return (replace(each, check=self.name) for each in findings)
 
 
@@ -231,7 +231,7 @@ STEPS = len(VIEW_PAIRS)
 
 
 def run_stage(state: State, stage: Stage) -> None:
-    """Run the checks of one stage; each has the findings of those before it."""
+    """Run the checks of one stage; each can use the findings of earlier ones."""
     for check in CHECKS:
         if check.stage == stage:
             state.findings += check.found(check.run(state))

@@ -1,6 +1,6 @@
-"""Comparing two pictures of one surface, compiled: the loops over pixels of ``depth_checks`` and ``image_checks``.
+"""Compiled loops over pixels for ``depth_checks`` and ``image_checks``, which compare two pictures of one surface.
 
-Arithmetic on pixels and colours is that of float32, in the order of the formulas.
+Pixels and colours are computed in float32, in the order of the formulas.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ F32 = NDArray[np.float32]
 
 
 class Evidence(NamedTuple):
-    """What partners show of every ``stride``-th pixel (h, w) of a depth map, which the loops fill in; in ``Bits``
-    each partner has one bit."""
+    """Evidence of the partners on every ``stride``-th pixel (h, w) of a depth map, filled in by the loops; in
+    ``Bits`` each partner has one bit."""
 
     confirmed: Bits
-    """The partner sees the same surface there, or the same sky."""
+    """The partner sees the same surface there, or also sees the sky."""
     contradicted: Bits
-    """The partner sees through it, or sees a surface hardly before it."""
+    """The partner sees through the surface, or sees another one slightly in front of it."""
     near: Flags
     """Some partner contradicts it by less than ``NEAR_MISS``."""
     hidden: Bits
-    """The partner sees a surface well before it: an occlusion, unless another says so too."""
+    """The partner sees one clearly in front of it: an occlusion, unless another partner sees one too."""
     difference: F32
-    """Smallest relative difference from a partner; infinite where nothing was compared."""
+    """Smallest relative difference from a partner; infinite if there was no comparison."""
 
 
 DEPTH_TOLERANCE = 1e-4
-"""Relative difference of two depths of one surface point that still agree."""
+"""Relative difference up to which two depths of one surface point agree."""
 NEAR_MISS = 1e-3
 """A surface hidden by less than this is a disagreement, not an occlusion; shallow reliefs hide by little more."""
 _LEAST_WIDTH = 0.5
 _CENTRED = 0.3
-"""Pixels from a pixel's centre within which a surface that spans its neighbours must be met by its ray."""
+"""Distance in pixels from a pixel's centre within which its ray must meet a surface that covers its neighbours."""
 
 
 @compiled(error_model="numpy")
@@ -53,16 +53,16 @@ def weigh_rows(
     first: int,
     last: int,
 ) -> None:
-    """Add what rows of a pair show to the evidence of both.
+    """Add the evidence in some rows of a source to both maps of a pair.
 
     Args:
         reprojection: pixels (h, w, 2) and relative depth (h, w) of every ``stride``-th pixel of the source.
-        even: whether each pixel (H, W) of the source lies on one flat surface; its depth (H, W); ``stride``.
-        evidence: of the source.
-        target: holes (H, W) of the target, of which two bands may set the same bit; its depth (H, W).
-        bits: of the target among the partners of the source, and of the source among those of the target.
-        near: (h, w) filled in: how far flat surfaces are apart that are not hidden; -1 elsewhere.
-        first, last: rows, without the last.
+        even: of the source: whether each pixel (H, W) lies on one flat surface; its depth (H, W); ``stride``.
+        evidence: evidence on the source, updated.
+        target: holes (H, W) of the target, updated; two bands may set the same bit. Its depth (H, W).
+        bits: bit of the target among the source's partners, and of the source among the target's.
+        near: (h, w) output: relative distance of flat surfaces that are not hidden; -1 elsewhere.
+        first, last: range of rows, ``last`` excluded.
     """
     pixels, relative = reprojection
     flats, depth, stride = even
@@ -92,7 +92,7 @@ def weigh_rows(
 
 @compiled(error_model="numpy")
 def _is_wide(pixels: F32, y: int, x: int, stride: int) -> bool:
-    """Whether what a source pixel spans is ``_LEAST_WIDTH`` pixels wide in the target, in every direction."""
+    """Return whether a source pixel covers ``_LEAST_WIDTH`` pixels of the target in every direction."""
     height, width = pixels.shape[:2]
     if height < 2 or width < 2:
         return False
@@ -109,7 +109,7 @@ def _is_wide(pixels: F32, y: int, x: int, stride: int) -> bool:
 
 @compiled(error_model="numpy")
 def _mark_hole(u: float, v: float, holes: Bits, depth: F32, bit: np.uint8) -> None:
-    """A pixel of the target without a surface although the middle of a flat one lies there."""
+    """Mark a target pixel without a surface if a flat source surface lands near its centre."""
     if not np.isfinite(u):
         return
     near_x, near_y = np.rint(u), np.rint(v)
@@ -122,16 +122,16 @@ def _mark_hole(u: float, v: float, holes: Bits, depth: F32, bit: np.uint8) -> No
 
 
 class Shown(NamedTuple):
-    """A source, and what a target shows of its pixels."""
+    """A source, and where a target shows its pixels."""
 
     colours: F32
     """(H, W, 3) codes of the source."""
     even: Flags
     """(H, W) whether a pixel sees one flat surface, or the sky."""
     pixels: F32
-    """(h, w, 2) where, of every ``stride``-th pixel of the source."""
+    """(h, w, 2) place in the target of every ``stride``-th pixel of the source."""
     relative: F32
-    """(h, w)."""
+    """(h, w) relative depth, see ``reprojection.Reprojection``."""
     stride: int
 
 
@@ -144,18 +144,18 @@ def vote_rows(
     first: int,
     last: int,
 ) -> NDArray[np.int64]:
-    """Count the pixels in rows of a source that see one surface in both pictures, and those of another colour.
+    """Count the pixels in rows of a source whose surface the target sees too, and those with another colour there.
 
     Args:
-        shown: see there.
-        span: of the target, the smallest and largest codes (H, W, 3) of the 3 x 3 pixels around each; how far
-            beyond is allowed.
-        votes: of the source, see ``image_checks.compare``.
-        bands: number of the band (H,) of each row; (2, B) not used, for its shape.
-        first, last: of the strided rows, without the last.
+        shown: the source, and its places in the target.
+        span: smallest and largest codes (H, W, 3) of the 3 x 3 neighbourhoods of the target; the tolerance beyond
+            them.
+        votes: votes on the source, updated; see ``image_checks.compare``.
+        bands: number of the band (H,) of each row; an array (2, B) of which only the shape is used.
+        first, last: range of the strided rows, ``last`` excluded.
 
     Returns:
-        (2, B) compared and beyond, of these rows.
+        (2, B) numbers of compared pixels, and of those beyond the tolerance, in these rows.
     """
     low, high, allowed = span
     seen, against = votes
@@ -187,8 +187,8 @@ def vote_rows(
 
 @compiled(error_model="numpy")
 def every_nth(shown: Shown, every: int, places: NDArray[np.int64]) -> int:
-    """Fill ``places`` (n, 2) with rows and columns of the source of every ``every``-th pixel that ``vote_rows``
-    counts, and return how many they are."""
+    """Fill ``places`` (n, 2) with the row and column of every ``every``-th source pixel that ``vote_rows`` counts;
+    return the number of places."""
     number, found = 0, 0
     for row in range(shown.relative.shape[0]):
         for column in range(shown.relative.shape[1]):
@@ -211,16 +211,16 @@ def costs_of_changes(
     cap: float,
     sums: NDArray[np.float64],
 ) -> None:
-    """Sums over the samples of each band of what changes of an image leave of its difference from what is shown.
+    """Sum the differences from the target that each change of an image leaves, over the samples of each band.
 
     Args:
         image: (H, W, 3) codes.
         places: (n, 2) rows and columns of samples.
-        shown: (n, 3) codes.
+        shown: (n, 3) codes of the target at the samples.
         bands: (n,) number of the band of each sample.
-        changes: (C, 7) of each ``down``, ``right``, ``flip_x``, ``flip_y`` and ``order``; the first is none.
+        changes: (C, 7) ``down``, ``right``, ``flip_x``, ``flip_y`` and ``order`` of each; the first is no change.
         cap: the largest difference of a channel that counts.
-        sums: (2, C, B) to which capped differences and squares of what they gain over none are added.
+        sums: (2, C, B) output, to which capped differences and squared gains over no change are added.
     """
     height, width = image.shape[:2]
     for i in range(len(places)):

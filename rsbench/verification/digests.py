@@ -19,18 +19,18 @@ from rsbench.storage.files import read_depth, read_json, read_png, sha256
 from rsbench.storage.untrusted_files import NAME, inside, read_text
 
 _NOT_DIGESTED = ("made_by", "files")
-"""Keys of sequence.json: versions, which may change while no byte of a file does, and hashes, taken here anew."""
+"""Keys of sequence.json left out: versions, which may change while no file does, and hashes, computed anew."""
 _LINE = re.compile(rf"([0-9a-f]{{64}})  ({NAME.pattern})")
 
 
 def digests(folder: Path) -> Iterator[tuple[str, str]]:
-    """Name and digest of each sequence of a dataset, in its order.
+    """Yield the name and digest of each sequence of a dataset, in its order.
 
-    A digest covers the truth in sequence.json (motion, cameras, scene, renderer, seed), and the path and content
-    of each file that it lists: frames, depth, poses, channels. It does not depend on dates, versions or folders.
+    A digest covers the ground truth in sequence.json (motion, cameras, scene, renderer, seed), and the path and
+    content of each listed file: frames, depth, poses, channels. It does not depend on dates, versions or folders.
 
     Raises:
-        RsbenchError: the dataset cannot be read, or has not a file that it lists.
+        RsbenchError: the dataset cannot be read, or a listed file is missing.
     """
     for sequence in read_dataset(folder):
         yield sequence.name, _digest(sequence)
@@ -51,15 +51,15 @@ def _digest(sequence: Sequence) -> str:
 
 
 def text_of(found: Mapping[str, str]) -> str:
-    """A line for each sequence: digest, two spaces, name."""
+    """Return a line for each sequence: digest, two spaces, name."""
     return "".join(f"{digest}  {name}\n" for name, digest in found.items())
 
 
 def read_digests(path: Path) -> dict[str, str]:
-    """Digests by the names of sequences, from a file of such lines.
+    """Read a file written by ``text_of``; returns the digests by sequence name.
 
     Raises:
-        RsbenchError: it cannot be read, or a line is another.
+        RsbenchError: the file cannot be read, a line has another form, or a name is repeated.
     """
     known = dict[str, str]()
     for number, line in enumerate(read_text(path).splitlines(), 1):
@@ -73,7 +73,7 @@ def read_digests(path: Path) -> dict[str, str]:
 
 
 def differences(found: Mapping[str, str], known: Mapping[str, str]) -> list[str]:
-    """What is other in a dataset than in a file of digests, a line for each sequence."""
+    """Describe how a dataset differs from a file of digests, with a line for each differing sequence."""
     other = [
         f"{name}: {'has another digest' if name in known else 'is not in the file'}"
         for name, digest in found.items()
@@ -83,8 +83,8 @@ def differences(found: Mapping[str, str], known: Mapping[str, str]) -> list[str]
 
 
 GREY, DEPTH = 0.1, 1e-4
-"""How far the mean of the frame (grey levels) and the median of its depth (relative) may be from the copy's where
-bytes differ. On another vector width a sample in a thousand meets the other side of an edge: 0.02 levels."""
+"""Tolerances if bytes differ from the copy's: of the mean of the frame (grey levels) and of its median depth
+(relative). With another vector width, one sample in a thousand falls beyond an edge: 0.02 levels."""
 SIDE, FRAME = "left", 0
 _FILES = tuple(
     name.format(f"{SIDE}_{FRAME}") for name in ("rs/{}.png", "rs_clean/{}.png", "rs_depth/{}.exr", "poses/{}.csv")
@@ -92,21 +92,21 @@ _FILES = tuple(
 
 
 def references() -> dict[str, Path]:
-    """Datasets with a reference copy, by name."""
+    """Return the files of the reference copies by dataset name."""
     folder = shipped_folder("cards/references", "_cards/references")
     return {path.stem: path for path in sorted(folder.glob("*.json"))}
 
 
 def record_of(folder: Path, hashes: Mapping[str, str]) -> dict[str, Any]:
-    """What the file of a reference copy holds of a sequence.
+    """Return what the file of a reference copy records about a sequence.
 
     Args:
-        folder: of the sequence.
-        hashes: SHA-256 of its files, by their paths in it.
+        folder: folder of the sequence.
+        hashes: SHA-256 of its files, by their paths below the folder.
 
     Returns:
-        ``sha256`` of the hashes and paths of what the left camera sees; ``grey``, the mean of the frame, levels;
-        ``depth``, the median of its depth, metres.
+        ``sha256`` of the hashes and paths of the first left frame's files; ``grey``, the mean of that frame, grey
+        levels; ``depth``, the median of its depth, metres.
     """
     lines = [f"{hashes[name]}  {name}\n" for name in _FILES if name in hashes]
     depth = read_depth(inside(folder, _FILES[2]))
@@ -118,17 +118,17 @@ def record_of(folder: Path, hashes: Mapping[str, str]) -> dict[str, Any]:
 
 
 class Compared(NamedTuple):
-    """A sequence and that of the reference copy."""
+    """A sequence compared with the reference copy."""
 
     name: str
     same: bool
     """Whether all bytes are equal."""
     fault: str = ""
-    """What is not even alike, in one line."""
+    """The first difference beyond the tolerances, in one line; "" if there is none."""
 
 
 def against_reference(folder: Path) -> Iterator[Compared]:
-    """Each sequence of a dataset and that of its reference copy.
+    """Compare each sequence of a dataset with the reference copy.
 
     Raises:
         RsbenchError: the dataset cannot be read, or has no reference copy.

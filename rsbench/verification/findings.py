@@ -1,4 +1,4 @@
-"""Findings of verification as values, the line that is printed for each, and reports."""
+"""Findings of verification, the line that is printed for each, and reports."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from rsbench.core.errors import RsbenchError
 Progress = Callable[[str], None]
 """Called with the name of the sequence after each step."""
 _MOST_RUNS = 3
-"""Runs of rows that a finding names one by one."""
+"""Number of row ranges that a finding names one by one."""
 
 
 MISSING = "missing"
-"""Words of the finding of a file that a manifest lists and that is not there."""
+"""Words of the finding for a file that a manifest lists but that does not exist."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault of a dataset. ``str`` makes the line that is printed of it."""
+    """One fault of a dataset. ``str`` gives the line that is printed for it."""
 
     file: str
-    """Below the folder of the sequence; "" where ``words`` name it, being those of an error."""
+    """Path below the folder of the sequence; "" if ``words``, the text of an error, contain it."""
     words: str
     """The fault and its size."""
     rows: str = ""
@@ -42,7 +42,7 @@ class Finding:
 
     @classmethod
     def of(cls, error: RsbenchError) -> Finding:
-        """The finding that a file cannot be read; the error names its whole path."""
+        """Make a finding from the error that a file cannot be read; its message contains the whole path."""
         return cls("", str(error))
 
     def __str__(self) -> str:
@@ -56,14 +56,14 @@ class DepthAgreement:
     """How one depth map agrees with another."""
 
     source: str
-    """File below the folder of the sequence, as ``target`` is."""
+    """Path below the folder of the sequence, like ``target``."""
     target: str
     compared: int
-    """Pixels on a locally flat surface that lie on one in the target and are not plainly hidden there."""
+    """Pixels on a locally flat surface that land on one, or on none, in the target and are not clearly hidden."""
     agreeing: int
-    """The number of these that agree within ``reprojection.DEPTH_TOLERANCE``."""
+    """The number of these that agree within ``compiled_comparison.DEPTH_TOLERANCE``."""
     typical: float
-    """Median of the relative difference of the agreeing and near pixels."""
+    """Median relative difference of the compared pixels that land on a surface; NaN without any."""
     p99: float
     """Its 99th percentile."""
 
@@ -84,12 +84,12 @@ class SequenceReport:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """One line of each finding: file, rows, size of the fault and its likely cause."""
+        """One line for each finding: file, rows, size of the fault and its likely cause."""
         return tuple(map(str, self.findings))
 
 
 class Again(NamedTuple):
-    """A file, or rows of it, against what is made again."""
+    """A file, or some of its rows, compared with a new computation."""
 
     file: str
     fault: Finding | None
@@ -102,7 +102,7 @@ _Found = TypeVar("_Found")
 
 
 def reports_unreadable(check: Callable[_Args, Iterator[Finding]]) -> Callable[_Args, Iterator[Finding]]:
-    """A check that ends with a finding at the first file that it cannot read."""
+    """Wrap a check so that it ends with a finding at the first file that it cannot read."""
 
     @wraps(check)
     def run(*args: _Args.args, **options: _Args.kwargs) -> Iterator[Finding]:
@@ -115,7 +115,7 @@ def reports_unreadable(check: Callable[_Args, Iterator[Finding]]) -> Callable[_A
 
 
 def skips_unreadable(check: Callable[_Args, Iterator[_Found]]) -> Callable[_Args, Iterator[_Found]]:
-    """A check that ends at the first file that it cannot read, which another check has reported."""
+    """Wrap a check so that it ends at the first file that it cannot read, which another check has reported."""
 
     @wraps(check)
     def run(*args: _Args.args, **options: _Args.kwargs) -> Iterator[_Found]:
@@ -126,12 +126,12 @@ def skips_unreadable(check: Callable[_Args, Iterator[_Found]]) -> Callable[_Args
 
 
 def files_of(findings: Iterable[Finding]) -> set[str]:
-    """The files that findings name."""
+    """Return the files that findings name."""
     return {each.file for each in findings}
 
 
 def cheapest_cause(costs: Mapping[str, float], as_is: float, share: float = 0.2) -> str:
-    """What a file looks like instead, by the difference that undoing each candidate change leaves; "" for none.
+    """Describe what a file looks like, by the difference that undoing each candidate change leaves; "" for none.
 
     The best candidate must leave less than this ``share`` of the difference ``as_is``.
     """
@@ -140,7 +140,7 @@ def cheapest_cause(costs: Mapping[str, float], as_is: float, share: float = 0.2)
 
 
 def rows_with_most(wrong: NDArray[np.bool_], stride: int = 1, height: int | None = None) -> str:
-    """The rows with more than half as many wrong pixels (h, w) as the worst row, in words.
+    """Describe the rows with more than half as many wrong pixels (h, w) as the worst row.
 
     ``wrong`` has every ``stride``-th row of an image of this ``height``.
     """
@@ -149,7 +149,7 @@ def rows_with_most(wrong: NDArray[np.bool_], stride: int = 1, height: int | None
 
 
 def rows_of(flags: NDArray[np.bool_]) -> str:
-    """Rows (H,) in words: "all rows", "rows 3-9, 12 and 40 more"; "" for none."""
+    """Describe rows (H,) in words: "all rows", "rows 3-9, 12 and 40 more"; "" for none."""
     rows = np.flatnonzero(flags)
     if len(rows) == 0:
         return ""

@@ -1,4 +1,4 @@
-"""Images against each other: under diffuse light a surface has one colour, whichever frame shows it."""
+"""Compare images: under diffuse light a surface has the same colour in every frame that shows it."""
 
 from __future__ import annotations
 
@@ -31,39 +31,39 @@ if TYPE_CHECKING:
 
 Colours = NDArray[np.float32]
 _BEYOND = 6.0
-"""8-bit codes by which a pixel may lie beyond the 3 x 3 pixels of another frame around its surface: rounding of
-both is 1, and the rest what the sub-pixel grids of two frames see of a texture finer than a pixel."""
+"""Tolerance in 8-bit codes beyond the range of the 3 x 3 pixels of another frame around a surface point: rounding
+of both is 1; the rest allows for texture finer than a pixel, which two pixel grids sample differently."""
 _NOISE_FACTOR = 4.0
-"""Standard deviations of a path-traced image's noise that are added to it."""
+"""Standard deviations of a path-traced image's noise that are added to this tolerance."""
 _CAP = 30.0
 """Largest difference of codes that counts, so that a few edges do not decide."""
 _BANDS, _LEAST_BAND = 12, 8
-"""Bands of rows that are judged by themselves, and their least height."""
+"""Number of bands of rows that are judged separately, and their smallest height."""
 _LEAST_PIXELS = 60
-"""Pixels of a band below which it is not judged."""
+"""Number of pixels below which a band is not judged."""
 _UNLIKE, _UNLIKE_WHOLE = 0.5, 0.22
-"""Share of a band's pixels that lie beyond: sound data of one sample per pixel has up to 0.36;
-and of all pixels of a pair, where it has 0.17."""
+"""Largest share of a band's pixels, and of all pixels of a pair, that may exceed the tolerance: sound data of one
+sample per pixel reaches 0.36 and 0.17."""
 _BETTER, _GAIN = 0.8, 0.5
-"""A change of the image that brings the mean difference below 0.8 of what it was, and 0.5 codes down, is what was
-done to it: clean data has 1.4 at the least where there is texture. Below 0.8 of what one colour leaves, too: a
-part that is only darker, or has less noise, is nearer to noise than the right one is, but no nearer than that."""
+"""A change explains a band if it lowers the mean difference to less than 0.8 of what it was, and by 0.5 codes; on
+textured sound data the factor is at least 1.4. It must also be below 0.8 of what a single colour leaves: a part
+that is only darker or less noisy is closer to noise than the right part is, but no closer than that."""
 _LEAST_EVIDENCE = 3
-"""Bands of pairs, each direction by itself, below which an image is not blamed unless two partners disagree with
-it: a small one errs by chance."""
+"""Number of differing bands, counted for both directions of a pair, below which an image is blamed only if two
+partners disagree with it: a small image may differ by chance."""
 _CHANCE = 3.0
-"""Standard errors of a band's gain by which chance may favour one of the changes."""
+"""Number of standard errors that a change's gain in a band must exceed, as chance may favour a change."""
 _TILE, _BAD_IN_TILE = 16, 0.6
 _SAMPLES = 60_000
 _REMAPPED = 512
-"""Places in a row of those that OpenCV is given: it takes no more than 32767."""
+"""Number of places in each row of the map given to OpenCV, which accepts at most 32767."""
 
 _PERMUTATIONS = [order for order in permutations(range(3)) if order != (0, 1, 2)]
 
 
 @dataclass(frozen=True)
 class Change:
-    """A change that an image may have undergone: where it shows the true colour of a pixel."""
+    """A change that an image may have undergone: where the changed image shows the true colour of a pixel."""
 
     words: str
     down: int = 0
@@ -73,7 +73,7 @@ class Change:
     order: tuple[int, ...] = (0, 1, 2)
 
     def undone(self, image: Colours, y: NDArray[np.int64], x: NDArray[np.int64]) -> Colours:
-        """Colours (n, 3) of pixels as they would be without it."""
+        """Return the colours (n, 3) of pixels with the change undone."""
         height, width = image.shape[:2]
         y = np.clip((height - 1 - y if self.flip_y else y) + self.down, 0, height - 1)
         x = np.clip((width - 1 - x if self.flip_x else x) + self.right, 0, width - 1)
@@ -93,24 +93,24 @@ CHANGES = (
 )
 _TABLE = np.array([[c.down, c.right, c.flip_x, c.flip_y, *c.order] for c in CHANGES], dtype=np.int64)
 _SHIFTS = slice(1, 5)
-"""A path tracer's frame and its global-shutter twin, whose pixels have the same noise, cannot show these changes:
+"""Changes that a path-traced frame and its global-shutter twin cannot show, as their pixels have the same noise:
 where the surface moves by about a pixel, the noise looks shifted."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image in float32, and what its neighbourhoods span."""
+    """An image in float32, and the range of colours around each pixel."""
 
     view: ImageView
     colours: Colours
     """(H, W, 3) 8-bit codes."""
     noise: float
-    """Standard deviation of what looks like noise in it, codes."""
+    """Standard deviation of the apparent noise, codes."""
     low: NDArray[np.uint8]
-    """(H, W, 3) smallest of the 3 x 3 pixels around; ``high`` likewise."""
+    """(H, W, 3) smallest code of the 3 x 3 neighbourhood; ``high`` is the largest."""
     high: NDArray[np.uint8]
     noisy: bool = False
-    """Whether a path tracer made it, so that what looks like noise is."""
+    """Whether a path tracer made the image, so that its apparent noise is real."""
 
     @classmethod
     def of(cls, view: ImageView, image: NDArray[np.uint8], noisy: bool) -> Picture:
@@ -121,13 +121,13 @@ class Picture:
 
     @property
     def beyond(self) -> float:
-        """Codes by which a colour may lie beyond ``low`` and ``high``."""
+        """Codes by which a colour may lie outside the range from ``low`` to ``high``."""
         return _BEYOND + (_NOISE_FACTOR * self.noise if self.noisy else 0.0)
 
 
 def noise_of(colours: Colours) -> float:
-    """Standard deviation of the noise, in codes: J. Immerkaer, Fast noise variance estimation, CVIU 1996,
-    with the median in place of the mean, which texture would raise."""
+    """Estimate the standard deviation of the noise, in codes: J. Immerkaer, Fast noise variance estimation, CVIU
+    1996, with the median in place of the mean, which texture would raise."""
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
     response = np.abs(cv2.filter2D(colours, cv2.CV_32F, kernel))[1:-1, 1:-1]
     return float(np.median(response)) / 0.6745 / 6.0 if response.size else 0.0
@@ -135,22 +135,22 @@ def noise_of(colours: Colours) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ColourAgreement:
-    """How an image looks like what another one shows of the same surface, by bands of rows."""
+    """How well an image agrees with another one on the surfaces that both show, by bands of rows."""
 
     source: ImageView
     target: ImageView
     pixels: NDArray[np.float64]
-    """(B,) compared."""
+    """(B,) number of compared pixels."""
     beyond: NDArray[np.float64]
-    """(B,) share of them that the other frame's neighbourhood does not span."""
+    """(B,) share of these outside the colour range of the other frame's neighbourhood."""
     costs: NDArray[np.float64]
-    """(C, B) mean absolute difference of each of ``CHANGES``, codes."""
+    """(C, B) mean absolute difference after undoing each of ``CHANGES``, codes."""
     errors: NDArray[np.float64]
-    """(C, B) standard error of what each change gains over none."""
+    """(C, B) standard error of the gain of each change over no change."""
     plain: NDArray[np.float64]
-    """(B,) what the best single colour would cost."""
+    """(B,) mean absolute difference that the best single colour would leave, codes."""
     refuted: BoolArray
-    """(C, B) changes of the source that this pair cannot show, or that another partner clearly contradicts, see
+    """(C, B) changes of the source that this pair cannot show, or that another partner clearly contradicts; see
     ``without_refuted``."""
 
     @property
@@ -159,7 +159,7 @@ class ColourAgreement:
 
     @property
     def better(self) -> NDArray[np.int64]:
-        """(B,) number of the change that explains a band better than none; 0 for none."""
+        """(B,) index of the change that explains a band better than no change; 0 if there is none."""
         costs = np.where(self.refuted, np.inf, self.costs)
         best, bands = np.argmin(costs, axis=0), np.arange(costs.shape[1])
         least, needed = costs[best, bands], np.maximum(_GAIN, _CHANCE * self.errors[best, bands])
@@ -169,14 +169,14 @@ class ColourAgreement:
 
     @property
     def worse(self) -> BoolArray:
-        """(C, B) changes that make the likeness of a band worse, as clearly as ``better`` ones make it better."""
+        """(C, B) changes that worsen the agreement of a band as clearly as those of ``better`` improve it."""
         least, needed = self.costs[0], np.maximum(_GAIN, _CHANCE * self.errors)
         clear = (least < _BETTER * self.costs) & (least < self.costs - needed)
         return np.asarray(clear & self.judged)
 
     @property
     def unlike(self) -> BoolArray:
-        """(B,) bands in which the two images do not show the same."""
+        """(B,) bands in which the two images show different colours."""
         pixels = float(np.sum(self.pixels))
         whole = pixels > 0 and float(np.sum(self.beyond * self.pixels)) > _UNLIKE_WHOLE * pixels
         allowed = _UNLIKE_WHOLE if whole else _UNLIKE
@@ -184,13 +184,13 @@ class ColourAgreement:
 
 
 def band_of_row(height: int) -> NDArray[np.int64]:
-    """(H,) number of the band that a row belongs to."""
+    """Return the number of the band (H,) of each row."""
     bands = max(1, min(_BANDS, height // _LEAST_BAND))
     return np.arange(height) * bands // height
 
 
 def shown_by(source: Picture, surface: DepthMap, reprojection: Reprojection, stride: int) -> Shown:
-    """A source for compiled loops; ``reprojection`` has every ``stride``-th pixel."""
+    """Return a source for the compiled loops; ``reprojection`` has every ``stride``-th pixel."""
     even = surface.flat | (surface.depth == 0)
     return Shown(source.colours, even, reprojection.pixels, reprojection.relative, stride)
 
@@ -198,10 +198,10 @@ def shown_by(source: Picture, surface: DepthMap, reprojection: Reprojection, str
 def sampled(
     shown: Shown, target: Picture, count: int, every: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Colours]:
-    """Places in a source that see one surface, or the sky, as the target does: every ``every``-th of ``count``.
+    """Sample every ``every``-th of the ``count`` source pixels that see the same surface, or sky, as the target.
 
     Returns:
-        Their rows and columns (n,), and the target's colours (n, 3) there.
+        Rows and columns (n,) of the samples, and the target's colours (n, 3) there.
     """
     places = np.zeros((count // every + 1, 2), dtype=np.int64)
     y, x = places[: every_nth(shown, every, places)].T
@@ -209,7 +209,7 @@ def sampled(
 
 
 def _interpolated(colours: Colours, places: NDArray[np.float32]) -> Colours:
-    """Colours (n, 3) of an image at places (n, 2)."""
+    """Interpolate the colours (n, 3) of an image at places (n, 2)."""
     rows = -(-len(places) // _REMAPPED)
     whole = np.zeros((rows * _REMAPPED, 2), np.float32)
     whole[: len(places)] = places
@@ -223,7 +223,7 @@ def _interpolated(colours: Colours, places: NDArray[np.float32]) -> Colours:
 
 
 def difference(colours: Colours, shown: Colours) -> Colours:
-    """(n,) mean absolute difference of channels, capped."""
+    """Return the mean absolute difference (n,) of the channels, each limited to ``_CAP``."""
     return np.asarray(np.mean(np.minimum(np.abs(colours - shown), _CAP), axis=1))
 
 
@@ -235,9 +235,9 @@ def compare(
     votes: NDArray[np.uint8],
     stride: int = 1,
 ) -> ColourAgreement:
-    """Compare the pixels that see one flat surface, or the sky, in both, of every ``stride``-th.
+    """Compare every ``stride``-th pixel of the source that sees one flat surface, or the sky, in both pictures.
 
-    To ``votes`` (2, H, W) it adds 1 at each pixel whose surface the target sees, and 1 where in another colour.
+    ``votes`` (2, H, W) increase by 1 at each pixel whose surface the target sees, and by 1 if its colour differs.
     """
     shown = shown_by(source, surface, reprojection, stride)
     bands = band_of_row(len(shown.even))
@@ -256,8 +256,8 @@ def compare(
 def _costs(
     shown: Shown, target: Picture, bands: NDArray[np.int64], pixels: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Means over the pixels of each band of the capped difference from the target, measured at some of ``pixels``:
-    (C, B) after each change, (C, B) standard errors of the change's gain, (B,) for the band's middle colour."""
+    """Return mean capped differences from the target in each band, measured at some of ``pixels``: (C, B) after
+    each change, (C, B) standard errors of the gains, (B,) for the median colour of the band."""
     every, count = max(1, pixels // _SAMPLES), int(bands[-1]) + 1
     y, x, seen = sampled(shown, target, pixels, every)
     of, places = bands[y], np.stack([y, x], axis=1)
@@ -274,8 +274,8 @@ def _costs(
 
 
 def without_refuted(agreements: list[ColourAgreement]) -> list[ColourAgreement]:
-    """The same, where no change of an image stands that another partner refutes: what is wrong with an image, all
-    see; but a texture finer than a pixel is another one from each place."""
+    """Mark changes of an image as refuted if another partner contradicts them: a real fault shows against all
+    partners, while texture finer than a pixel looks different from each place."""
     result = []
     for each in agreements:
         others = [other.worse for other in agreements if other.source == each.source and other is not each]
@@ -297,7 +297,7 @@ def wrong_images(agreements: list[ColourAgreement]) -> Iterator[tuple[ImageView,
 
 
 def tile_rows(votes: NDArray[np.uint8]) -> BoolArray:
-    """(H,) rows of tiles in which most pixels look unlike what two partners show."""
+    """Return the rows (H,) of tiles in which most pixels differ from what two partners show."""
     seen, against = (np.asarray(each >= 2, dtype=np.int64) for each in votes)
     height = seen.shape[0]
     rows, columns = np.arange(0, height, _TILE), np.arange(0, seen.shape[1], _TILE)
@@ -309,7 +309,7 @@ def tile_rows(votes: NDArray[np.uint8]) -> BoolArray:
 
 
 def single_colour_fault(picture: Picture, others: Mapping[ImageView, Picture]) -> Finding | None:
-    """An image of one colour, or of greys where others have colours."""
+    """Return a finding for an image of one colour, or a grey image among coloured ones; None for other images."""
     if np.ptp(picture.colours) == 0 and any(np.ptp(other.colours) > 0 for other in others.values()):
         codes = ", ".join(f"{code:g}" for code in picture.colours[0, 0])
         what = "black" if not np.any(picture.colours) else f"of one colour ({codes})"
@@ -320,27 +320,26 @@ def single_colour_fault(picture: Picture, others: Mapping[ImageView, Picture]) -
 
 
 def _chroma(picture: Picture) -> float:
-    """Mean distance of the channels from their mean, codes."""
+    """Return the mean absolute deviation of the channels from the mean of their pixel, codes."""
     grey = np.mean(picture.colours, axis=2, keepdims=True)
     return float(np.mean(np.abs(picture.colours - grey)))
 
 
 OtherImages = Callable[[ImageView], Iterable[tuple[str, NDArray[np.uint8]]]]
-"""Names and images of other sequences that may have been exchanged with a view's."""
+"""Names and images of other frames and sequences that may have been exchanged with a view's image."""
 _TRIED_PIXELS = 20_000
 _PLAIN, _AS_LIKE = 0.7, 1.4
-"""A candidate must differ by at most this share of what the image as it is does, and by this factor of what sound
-pairs do."""
+"""Largest difference of a candidate, relative to that of the unchanged image and that of sound pairs."""
 _NEARLY = 1.25
-"""A change of the image itself that is nearly as like is what happened, not an exchange."""
+"""A change of the image itself is preferred to an exchange if its difference is less than this times as large."""
 _NOISY, _NOISIER = 15.0, 3.0
-"""Codes of noise that few renderings have, and how many times as noisy as the others."""
+"""Noise in codes that few renderings exceed, and factor over the noise of the other images."""
 
 
 def colour_faults(
     content: Content, agreements: list[ColourAgreement], other_images: OtherImages
 ) -> Iterator[tuple[ImageView, Finding]]:
-    """A finding for each image that the others contradict."""
+    """Yield a finding for each image that the others contradict."""
     wrong = list(wrong_images(agreements))
     suspects = {view for view, _ in wrong}
     for view, pairs in wrong:
@@ -361,7 +360,7 @@ def colour_faults(
 
 
 def _of_bands(unlike: BoolArray, count: int) -> BoolArray:
-    """Flags of bands (B,) as of an image with so many, all of them for an image of another height."""
+    """Return flags (B,) for ``count`` bands; flags of an image of another height become one flag for all."""
     return unlike if len(unlike) == count else np.full(count, np.any(unlike))
 
 
@@ -372,7 +371,7 @@ def _image_cause(
     agreements: list[ColourAgreement],
     other_images: OtherImages,
 ) -> str:
-    """What turns the image into what the partner shows, as well as sound images are like each other."""
+    """Describe the change or exchange that explains the image about as well as sound images agree; "" for none."""
     sequence, maps, pictures = content.sequence, content.maps, content.pictures
     others = [(other.image, picture.colours) for other, picture in pictures.items() if other != view]
     others += [(name, image.astype(np.float32)) for name, image in other_images(view)]
@@ -408,6 +407,6 @@ def _is_noise(pictures: Mapping[ImageView, Picture], view: ImageView, rows: Bool
 
 
 def _usual_difference(agreements: list[ColourAgreement]) -> float:
-    """Mean difference, in codes, of the least unlike half of the pairs."""
+    """Return the median, over the better half of the pairs, of their mean difference in codes."""
     costs = [float(np.average(each.costs[0], weights=each.pixels)) for each in agreements if np.any(each.pixels)]
     return float(np.median(sorted(costs)[: len(costs) // 2 + 1])) if costs else 0.0

@@ -1,4 +1,4 @@
-"""Checks of dataset.json, its card, each sequence.json and the folders against each other."""
+"""Check dataset.json, its card, each sequence.json and the folders against each other."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from rsbench.verification.findings import MISSING, Finding
 
 _TEXTS = ("name", "description", "rsbench", "mitsuba")
 _MOST_NAMES = 5
-"""Files that one finding names."""
+"""Number of files that one finding names."""
 MOST_MISSING = 100
-"""Sequences without a folder that are reported one by one."""
+"""Number of sequences without a folder that are reported one by one."""
 _SAME = 1e-12
-"""Relative difference of two numbers that were computed from the same card: a thousand roundings."""
+"""Relative tolerance of numbers that were computed from the same card: a thousand rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +41,11 @@ class Listing:
     folder: Path
     manifest: Mapping[str, Any]
     card: DatasetCard | Finding
-    """The card, or the fault that it is none."""
+    """The card, or a finding if it cannot be parsed."""
     names: tuple[str, ...]
-    """Names of sequences that may be opened: folders in the dataset, each once."""
+    """Valid names of sequences, each once; none leads out of the dataset's folder."""
     files: Mapping[str, Mapping[str, object]]
-    """What ``files`` says of each sequence, by its name and the path below its folder."""
+    """Entries of ``files`` by sequence name, then by path below the sequence's folder."""
     planned: Mapping[str, SequenceCard]
     """Sequences of the card by name."""
 
@@ -64,12 +64,12 @@ class Listing:
 
 
 def is_name(name: object) -> bool:
-    """Whether this is a name that a card may give to a sequence, and so no path."""
+    """Return whether a card may give this name to a sequence; such a name is never a path."""
     return isinstance(name, str) and NAME.fullmatch(name) is not None
 
 
 def dataset_faults(listing: Listing) -> Iterator[Finding]:
-    """What is wrong with dataset.json as a whole."""
+    """Find faults of dataset.json as a whole."""
     manifest, card = listing.manifest, listing.card
     if manifest.get("format") not in FORMATS or isinstance(manifest.get("format"), bool):
         yield Finding(DATASET, f"format = {manifest.get('format')!r}: {FORMATS[0]} or {FORMATS[1]} is needed")
@@ -110,9 +110,9 @@ def _name_faults(names: object) -> Iterator[Finding]:
 
 
 def missing_sequences(listing: Listing) -> dict[str, Finding | None]:
-    """Sequences without a folder, or with an empty one, in the order of the list.
+    """Find sequences without a folder, or with an empty one, in the order of the list.
 
-    The first ``MOST_MISSING`` have a finding each; the last of these says how many more there are.
+    The first ``MOST_MISSING`` have a finding each; the last of these gives the number of the others.
     """
     found: dict[str, Finding | None] = dict.fromkeys(name for name in listing.names if _is_empty(listing, name))
     more = len(found) - MOST_MISSING
@@ -134,7 +134,7 @@ def _is_empty(listing: Listing, name: str) -> bool:
 
 
 def _listing_faults(listing: Listing) -> Iterator[Finding]:
-    """``files`` against the sequences and the disk; each file's content is looked at with its sequence."""
+    """Compare ``files`` with the sequences and the disk; the content of files is checked with their sequence."""
     folder, files = listing.folder, listing.manifest.get("files")
     if not isinstance(files, dict):
         yield Finding(DATASET, f"files = {files!r}: a table of paths is needed")
@@ -149,7 +149,7 @@ def _listing_faults(listing: Listing) -> Iterator[Finding]:
 
 
 def _croissant_faults(listing: Listing) -> Iterator[Finding]:
-    """croissant.json against dataset.json, where there is one that this version wrote."""
+    """Compare croissant.json with dataset.json, if it exists and this version of rsbench made the dataset."""
     path = listing.folder / CROISSANT
     if not path.is_file() or listing.manifest.get("rsbench") != __version__:
         return
@@ -168,7 +168,7 @@ def _stays_inside(path: str) -> bool:
 
 
 def _hidden(path: Path) -> bool:
-    """Names with a dot in front belong to the system, or to a run at work: no reader opens them."""
+    """Return whether a part starts with a dot: files of the system or a running job, which no reader opens."""
     return any(part.startswith(".") for part in path.parts)
 
 
@@ -178,7 +178,7 @@ def _some(names: list[str]) -> str:
 
 
 def _card_of(manifest: Mapping[str, Any]) -> DatasetCard | Finding:
-    """The card of dataset.json, or the fault that it is none."""
+    """Parse the card of dataset.json; return a finding if it cannot be parsed."""
     card = manifest.get("card")
     if not isinstance(card, dict):
         return Finding(DATASET, f"card = {card!r}: the card of the dataset is needed")
@@ -189,7 +189,7 @@ def _card_of(manifest: Mapping[str, Any]) -> DatasetCard | Finding:
 
 
 def file_faults(listing: Listing, name: str) -> Iterator[Finding]:
-    """Files of a sequence against both manifests: there, listed in both, and with the bytes that they say."""
+    """Check that the files of a sequence exist, are listed in both manifests, and match their checksums."""
     folder, listed, below = listing.folder, listing.files[name], f"{name}/"
     own, needed, fault = _own_files(folder / name)
     if fault:
@@ -205,7 +205,7 @@ def file_faults(listing: Listing, name: str) -> Iterator[Finding]:
 
 
 def _own_files(folder: Path) -> tuple[dict[str, object], tuple[str, ...], Finding | None]:
-    """``files`` of a sequence.json, those that it must have, and what is wrong with them."""
+    """Return ``files`` of a sequence.json, the files that it must have, and a finding if it is faulty."""
     try:
         manifest = read_json(inside(folder, "sequence.json"))
     except RsbenchError as error:
@@ -246,7 +246,7 @@ def _content_faults(folder: Path, name: str, entry: object, own: object) -> Iter
 
 
 def sequence_faults(sequence: Sequence, name: str, listing: Listing) -> Iterator[Finding]:
-    """What sequence.json says against itself, its folder and the card."""
+    """Check that sequence.json is consistent with itself, its folder's name and the card."""
     file, manifest = "sequence.json", sequence.manifest
     expected = sequence_manifest(
         name=name,
@@ -271,7 +271,7 @@ def sequence_faults(sequence: Sequence, name: str, listing: Listing) -> Iterator
 
 
 def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: SequenceCard) -> Iterator[Finding]:
-    """sequence.json against what the card would make, as far as that is known without building the scene."""
+    """Compare sequence.json with its card, as far as that is possible without building the scene."""
     made = manifest.get("made_by")
     same_version = isinstance(made, dict) and made.get("rsbench") == __version__
     planned = dict.fromkeys(
@@ -280,7 +280,7 @@ def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: Seque
     planned["seed"] = card.seed_of(sequence)
     start = None if sequence.start is None else asdict(sequence.start)
     scene: dict[str, Any] = {"viewpoint": sequence.viewpoint, "start": start}
-    # The cards that come with another version may say other things.
+    # The built-in cards of another version may have other values.
     if same_version and sequence.scene in list_cards("scenes"):
         built_in, _ = read_scene_card(list_cards("scenes")[sequence.scene])
         scene |= {"name": built_in.name}
@@ -306,7 +306,7 @@ def _card_faults(manifest: Mapping[str, Any], card: DatasetCard, sequence: Seque
 
 
 def _equal(stored: object, expected: object) -> bool:
-    """Equal as JSON holds it, numbers to rounding; a truth value is no number."""
+    """Return whether a JSON value equals an expected one, numbers up to rounding; a boolean is not a number."""
     if isinstance(expected, Mapping):
         if not isinstance(stored, Mapping) or stored.keys() != expected.keys():
             return False

@@ -1,4 +1,4 @@
-"""Masks of glossy surfaces and labels of moving objects, against rays, depth and each other."""
+"""Check masks of glossy surfaces and labels of moving objects against rays, depth and each other."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from rsbench.verification.reprojection import BoolArray, DepthMap, nearest, repr
 from rsbench.verification.rerender import Rerenderer
 
 _OTHER, _FEW = 1e-3, 8
-"""Share and number of pixels that rounding on another processor may change, at edges."""
+"""Share and number of pixels at edges that may differ due to rounding on another processor."""
 _LEAST_LEFT = 0.05
-"""Share of the pixels with a surface that must be left to be compared, unless rays say that it is glossy."""
+"""Smallest share of the pixels with a surface that must remain for comparison if no rays confirm the mask."""
 _TRIED_PIXELS = 60_000
 
 
 def known_gloss(content: Content, again: Rerenderer | None) -> tuple[list[Finding], bool]:
-    """Faults of masks against rays, which take their place; and whether there were rays to ask."""
+    """Compare masks with traced rays, which then replace them; return faults, and whether rays were available."""
     sequence = content.sequence
     if again is None or not content.maps:
         return [], not content.maps
@@ -52,7 +52,7 @@ def known_gloss(content: Content, again: Rerenderer | None) -> tuple[list[Findin
 
 
 def _is_ours(content: Content, digest: str) -> bool:
-    """Whether a scene that was built here must be that of the sequence: of the same hash, or the same version."""
+    """Return whether a scene built here must be that of the sequence: its hash or its version is the same."""
     scene, made_by = (content.sequence.manifest.get(key) for key in ("scene", "made_by"))
     same = isinstance(scene, dict) and scene.get("sha256") == digest
     return same or (isinstance(made_by, dict) and made_by.get("rsbench") == __version__)
@@ -67,12 +67,12 @@ def _unlike(stored: DepthMap, gloss: BoolArray) -> list[Finding]:
 
 
 def gloss_faults(content: Content, fresh: Content, twins: Content) -> Iterator[Finding]:
-    """What masks cannot be, where there are no rays. Their maps are taken out of all, as of ``label_faults``.
+    """Find impossible masks if there are no rays; maps whose masks contradict others are removed from all three.
 
     Args:
-        content: of two frames, the whole sequence.
-        fresh: what was read of it last.
-        twins: at other rows than the first.
+        content: the last two frames.
+        fresh: the frames that were read last.
+        twins: their global-shutter twins at rows other than the first.
     """
     if not content.sequence.glossy:
         return
@@ -114,7 +114,7 @@ def _unlike_twins(
 
 
 def _unlike_twin(content: Content, own: DepthMap, kind: Literal["gloss", "labels"], what: str) -> Finding | None:
-    """The line that a global-shutter picture shares with its rolling-shutter frame, if its masks differ."""
+    """Compare the masks on the line that a global-shutter picture shares with its rolling-shutter frame."""
     source, view = own.view._replace(shutter="rs", row=0), own.view
     if view == source or source not in content.maps:
         return None
@@ -128,13 +128,13 @@ def _unlike_twin(content: Content, own: DepthMap, kind: Literal["gloss", "labels
 
 
 def _mask_of(each: DepthMap, kind: Literal["gloss", "labels"]) -> NDArray[Any]:
-    """(H, W); 0 where there is no mask."""
+    """Return the mask (H, W), all 0 if there is none."""
     mask = getattr(each, kind)
     return np.zeros(each.depth.shape, dtype=np.uint8) if mask is None else mask
 
 
 def _contradicted(content: Content) -> Iterator[tuple[ImageView, Finding]]:
-    """Masks that others contradict, in the order of how many pairs each alone explains."""
+    """Yield masks that others contradict; the one that explains most of the remaining pairs comes first."""
     pairs = view_pairs((content.times[0], content.times[-1]))
     there = [(one, other) for one, other in pairs if {one, other} <= content.maps.keys()]
     wrong = {pair: _contradiction(content, *pair) for pair in there}
@@ -151,7 +151,7 @@ def _contradicted(content: Content) -> Iterator[tuple[ImageView, Finding]]:
 
 
 def _contradiction(content: Content, one: ImageView, other: ImageView) -> BoolArray:
-    """(H,) rows of a map in which even surfaces are marked, or not, as another map has it not."""
+    """Return the rows (H,) of a map in which its mask contradicts that of another map on flat surfaces."""
     source, target = content.maps[one], content.maps[other]
     stride = stride_for(source.depth.size, _TRIED_PIXELS)
     reprojection = reproject(content.sequence, source, target, stride)
@@ -167,7 +167,7 @@ def _contradiction(content: Content, one: ImageView, other: ImageView) -> BoolAr
 
 
 def _span(each: DepthMap) -> tuple[BoolArray, BoolArray]:
-    """(H, W) whether all of the 3 x 3 pixels around are glossy, and whether any is."""
+    """Return whether all pixels of each 3 x 3 neighbourhood are glossy, and whether any is, (H, W) each."""
     gloss, around = _mask_of(each, "gloss").astype(np.uint8), np.ones((3, 3), np.uint8)
     return cv2.erode(gloss, around) > 0, cv2.dilate(gloss, around) > 0
 
@@ -177,12 +177,12 @@ _FEW_LABELS = 8
 
 
 def label_faults(content: Content, fresh: Content, twins: Content) -> Iterator[Finding]:
-    """What labels cannot be. Their maps are taken out of all: they would accuse the depth of others.
+    """Find impossible labels; their maps are removed from all three, as they would accuse the depth of others.
 
     Args:
-        content: of two successive frames.
-        fresh: what was read of them last.
-        twins: at other rows than the first, of these last.
+        content: two successive frames.
+        fresh: the frames of these that were read last.
+        twins: global-shutter twins of ``fresh`` at rows other than the first.
     """
     if not content.sequence.moving:
         return
@@ -204,12 +204,12 @@ def _on_nothing(each: DepthMap) -> Finding | None:
 
 
 def _misplaced(content: Content, own: DepthMap) -> Finding | None:
-    """Surfaces through which partners see where their labels take them, and which they see where another would."""
+    """Find surfaces that partners do not see where their labels place them, but where another label would."""
     sequence, view = content.sequence, own.view
     stride = stride_for(own.depth.size, _TRIED_PIXELS)
     numbers = numbers_of(_mask_of(own, "labels"))
     elsewhere = np.zeros(own.depth[::stride, ::stride].shape, dtype=np.bool_)
-    # The other camera sees all of them at about the same time, which shows no movement.
+    # The other camera is left out: it sees all surfaces at about the same time, so that movement does not show.
     over_time = view._replace(frame=view.frame + 1, row=0), view.frame_before._replace(row=0)
     for partner in (view.other_shutter._replace(row=0), *over_time):
         if partner not in content.maps:
@@ -222,7 +222,7 @@ def _misplaced(content: Content, own: DepthMap) -> Finding | None:
                     np.abs(reproject(sequence, moved, content.maps[partner], stride).relative) <= DEPTH_TOLERANCE
                 )
                 elsewhere |= through & seen & (numbers[::stride, ::stride] != other)
-    # Along an edge that stands out by a hair, a line of pixels may lie by chance where another label takes it.
+    # Along a very low edge, a line of pixels may by chance lie where another label would place it.
     wide = cv2.morphologyEx(elsewhere.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     if np.sum(wide) <= _FEW_LABELS:
         return None

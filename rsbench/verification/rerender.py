@@ -1,4 +1,4 @@
-"""Rows rendered again, where the scene can be built here: the only check that knows what is true."""
+"""Render rows again if the scene can be built here: the only check that knows the ground truth."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ if TYPE_CHECKING:
 
 
 def with_files(sequence: Sequence, files: Many[Path]) -> tuple[MovingManifest, ...]:
-    """The objects of a sequence, their mesh files found by name among these.
+    """Return the moving objects of a sequence, with mesh files found by name among ``files``.
 
     Raises:
-        RsbenchError: a file that was not named, cannot be read, or is another than the sequence was made of.
+        RsbenchError: a mesh file was not named, cannot be read, or is not the one that the sequence was made from.
     """
     named = {path.name: path for path in files}
     hashes = sequence.manifest.get("meshes")
@@ -72,14 +72,14 @@ def with_files(sequence: Sequence, files: Many[Path]) -> tuple[MovingManifest, .
 
 
 SAME_DEPTH = 2e-6
-"""Relative: rays in float32 on another processor; on the same one they have the same bits."""
+"""Relative tolerance of float32 rays on another processor; on the same one they have the same bits."""
 _OTHER_CODES, _FAR_CODES, _FAR_ON_GPU = 0.05, 0.005, 0.02
-"""Shares of pixels that may differ at all, and by more than ``_NEAR_CODES``: rounding on another processor moves a
-sample across an edge now and then, and more often on a GPU, which intersects triangles by another rule."""
+"""Shares of pixels that may differ at all, and by more than ``_NEAR_CODES``: rounding on another processor may
+move a sample across an edge, more often on a GPU, which intersects triangles by another rule."""
 _NEAR_CODES = 2.0
 _OTHER_DEPTH = 0.005
 _OTHER_LABELS, _FEW_LABELS = 1e-3, 8
-"""Share and number of labels that rounding on another processor may change, at edges."""
+"""Share and number of labels at edges that may differ due to rounding on another processor."""
 
 
 def label_checks(stored: DepthMap, rendered: NDArray[np.uint8], rows: list[int]) -> Iterator[Again]:
@@ -112,7 +112,7 @@ def depth_check(stored: DepthMap, rendered: NDArray[np.float32], rows: list[int]
 def image_check(
     file: str, stored: Picture, rendered: NDArray[np.uint8], rows: list[int], noisy: bool, by_gpu: bool = False
 ) -> Again:
-    """``noisy``: by other random numbers; ``by_gpu``: one was rendered on a GPU and the other was not."""
+    """Compare an image; ``noisy``: with other random numbers; ``by_gpu``: only one of the two is from a GPU."""
     truth = rendered.astype(np.float32)
     difference = np.max(np.abs(stored.colours[rows] - truth), axis=-1)
     far = difference > _NEAR_CODES + (4 * stored.noise if noisy else 0.0)
@@ -134,22 +134,22 @@ def image_check(
 
 
 def _rows(wrong: NDArray[np.bool_], rows: list[int], height: int) -> str:
-    """Words for the rendered rows in which many pixels are wrong."""
+    """Describe the rendered rows in which many pixels are wrong."""
     flags = np.zeros(height, dtype=np.bool_)
     flags[np.asarray(rows)[np.mean(wrong, axis=1) > _OTHER_DEPTH]] = True
     return "all rows that were rendered" if np.sum(flags) == len(rows) else rows_of(flags)
 
 
 Rerender = Literal["no", "auto", "all"]
-"""No row, some rows of every image where that takes seconds, or all rows."""
+"""Rows to render again: none, some rows of each image if that takes seconds, or all rows."""
 _ALIKE = (": the same bits", ": the same but for rounding")
-"""Ends of the note where nothing differs."""
+"""Ends of the note if nothing differs."""
 _ROWS = 16
-"""Rows of each image that ``auto`` renders again."""
+"""Number of rows of each image that ``auto`` renders again."""
 _COMPRESSED = 4
-"""One in so many of these rows is made of a compressed frame: each takes 48 rows of the sensor."""
+"""One in this many of the rows is compared in a compressed frame, as each needs 48 rows of the sensor."""
 _MOST_RAYS = 2e8
-"""Rays of a sequence with ``auto``: the more samples, the fewer rows."""
+"""Largest number of rays for a sequence with ``auto``: more samples mean fewer rows. Also that for one image."""
 
 
 @dataclass(eq=False)
@@ -158,22 +158,22 @@ class Rerenderer:
 
     mode: Rerender
     scene_cards: Many[Path] = ()
-    """Cards of scenes that are not rsbench's own. The scene that a dataset names is never opened as a file."""
+    """Cards of scenes that are not built in. The scene that a dataset names is never opened as a file."""
     mesh_files: Many[Path] = ()
     """Mesh files of moving objects, likewise."""
     _built: tuple[tuple[object, ...], str, MitsubaScene] | None = field(default=None, init=False)
 
     def depth_is_rendered(self, content: Content, view: ImageView) -> bool:
-        """Whether a depth map is what its scene looks like, at every pixel: that takes but one ray for each."""
-        with contextlib.suppress(RsbenchError):  # reported by ``check``
+        """Return whether a depth map equals a new rendering at every pixel, which takes one ray per pixel."""
+        with contextlib.suppress(RsbenchError):  # reported by ``RerenderedRows``
             stored, rendered = content.maps[view].depth, self.whole(content, view)[1].depth
             return bool(np.all(np.abs(stored - rendered) <= SAME_DEPTH * np.maximum(stored, rendered)))
         return False
 
     def image_is_rendered(self, content: Content, view: ImageView) -> bool:
-        """Whether a picture, without its sensor, is what its scene looks like: all of it, with all samples."""
+        """Return whether a whole picture, without sensor effects, equals a new rendering with all samples."""
         camera = content.sequence.rig.sensor(view.side)
-        with contextlib.suppress(RsbenchError):  # reported by ``check``
+        with contextlib.suppress(RsbenchError):  # reported by ``RerenderedRows``
             options = _options_of(content.sequence)
             rows = list(range(camera.height))
             if _rays_of(camera.width, options) * camera.height > _MOST_RAYS:
@@ -184,7 +184,7 @@ class Rerenderer:
         return False
 
     def cleared(self, content: Content, accused: Collection[str]) -> set[str]:
-        """The accused files of channels whose bits are the same when they are made again by rays."""
+        """Return the accused channel files that are reproduced bit for bit with traced rays."""
         sequence, same = content.sequence, set[str]()
         with contextlib.suppress(RsbenchError):
             for view in [each for each in image_views(content.times) if each.shutter == "rs"]:
@@ -199,7 +199,7 @@ class Rerenderer:
         return same & set(accused)
 
     def whole(self, content: Content, view: ImageView) -> tuple[MitsubaScene, Frame]:
-        """The scene of a sequence, and a whole frame of it, of one sample."""
+        """Return the scene of a sequence, and a whole frame of it with one sample per pixel."""
         options = _options_of(content.sequence)
         scene, _ = self.scene(content.sequence)
         quick = replace(options, samples=1, integrator="sunsky")
@@ -207,7 +207,7 @@ class Rerenderer:
         return scene, _render(content, scene, quick, view, rows)
 
     def scene(self, sequence: Sequence) -> tuple[MitsubaScene, str]:
-        """The scene of a sequence in the renderer, and its hash."""
+        """Return the scene of a sequence in the renderer, and its hash."""
         from rsbench.renderers.scene import MitsubaScene
 
         record = _table(sequence.manifest, "scene")
@@ -228,7 +228,7 @@ class Rerenderer:
         moving = with_files(sequence, self.mesh_files)
         wanted = (path, path.stat().st_mtime_ns, viewpoint, start, moving)
         if self._built is None or self._built[0] != wanted:
-            self._built = None  # a scene takes hundreds of MB: not two at a time
+            self._built = None  # a scene takes hundreds of MB: never keep two at a time
             scene = load_scene(path)
             seen = scene.seen_from(scene.viewpoints[viewpoint], start)
             seen = with_moving(seen, moving) if moving else seen
@@ -237,7 +237,7 @@ class Rerenderer:
 
 
 class RerenderedRows:
-    """Rows of one sequence rendered again, some frames after the other."""
+    """Rows of one sequence rendered again, a few frames at a time."""
 
     def __init__(self, again: Rerenderer, sequence: Sequence) -> None:
         self._sequence, self._checks = sequence, list[Again]()
@@ -254,7 +254,7 @@ class RerenderedRows:
         self._seconds = time.perf_counter() - self._begun
 
     def add(self, content: Content, reported: set[str]) -> None:
-        """Render again what was read, but for channels that are ``reported`` already."""
+        """Render rows of frames that were just read, and compare all but ``reported`` channels."""
         if not self._refusal:
             self._take(self._row_checks(content, reported))
 
@@ -264,11 +264,11 @@ class RerenderedRows:
         self._seconds += time.perf_counter() - start
 
     def end(self, reported: set[str]) -> tuple[list[Finding], str]:
-        """Faults of files that are not ``reported`` yet, and what was done or why not."""
+        """Return faults of files that are not ``reported`` yet, and a note on what was done or why nothing was."""
         if self._refusal:
             return [], self._refusal
         manifest, checks = self._sequence.manifest, self._checks
-        left_out = reported | ({AFFINE} if TRACKS in reported else set())  # whose points those are
+        left_out = reported | ({AFFINE} if TRACKS in reported else set())  # affine frames at points of the tracks
         self._take(points_again(self._sequence, _rays(self._scene), lambda file: file not in left_out))
         wrong = [check for check in checks if check.fault]
         done = (
@@ -308,10 +308,10 @@ class RerenderedRows:
                     yield self._stack_check(content, view)
 
     def _sensed_check(self, content: Content, view: ImageView, reported: set[str]) -> Iterator[Again]:
-        """What the sensor makes of a rolling-shutter frame, or shows of a global-shutter picture without noise.
+        """Compare what the sensor makes of a rolling-shutter frame, or of a global-shutter picture without noise.
 
-        Each row of a sensor has random numbers of its own, so it can be made alone with the same bits; a row of an
-        image that was interpolated or compressed is made with the rows around it.
+        Each row of a sensor has its own random numbers, so it can be made alone with the same bits; a row of an
+        interpolated or compressed image is made together with the rows around it.
         """
         from rsbench.renderers.render import sensed_rows
 
@@ -330,7 +330,7 @@ class RerenderedRows:
             yield image_check(file, seen, made, some, not _made_here(content), _by_gpu(content))
 
     def _stack_check(self, content: Content, view: ImageView) -> Again:
-        """Rows of the stack at other rows' poses: row i of the image that is rendered at the pose of row j."""
+        """Compare rows of stack images that have other rows' poses: row i of the image at the pose of row j."""
         from rsbench.renderers.image import to_srgb8
         from rsbench.renderers.render import LinePoses, render
 
@@ -357,9 +357,9 @@ def _rays(scene: MitsubaScene, objects: Many[MovingObject] = ()) -> SceneRays:
 
 
 def _rows_of(mode: Rerender, sequence: Sequence, options: RendererOptions) -> dict[Side, list[int]]:
-    """One row of each of equal bands, drawn by the hash of the images, so that they cannot be known before these.
+    """Draw one row from each of equal bands, by the hashes of the files, so that nobody knows them in advance.
 
-    Those of each camera; the same where these have the same height.
+    Cameras of the same height have the same rows. The mode "all" returns all rows.
     """
     cameras = {side: sequence.rig.sensor(side) for side in SIDES}
     heights = {side: camera.height for side, camera in cameras.items()}
@@ -405,7 +405,7 @@ def _picture_check(
 
 
 def _by_gpu(content: Content) -> bool:
-    """Whether a GPU rendered only one of the two, the stored image or the new rendering."""
+    """Return whether only one of the stored image and the new rendering is from a GPU."""
     from rsbench.renderers.backend import VARIANTS, start_backend
 
     variants = {start_backend().variant, _table(content.sequence.manifest, "made_by").get("variant")}
@@ -413,7 +413,7 @@ def _by_gpu(content: Content) -> bool:
 
 
 def _made_here(content: Content) -> bool:
-    """Whether the same versions and variant rendered it, so that even random numbers are the same."""
+    """Return whether the same versions and variant rendered the dataset, so that random numbers are equal."""
     from rsbench.renderers.backend import start_backend
 
     here = {"mitsuba": version("mitsuba"), "drjit": version("drjit"), "variant": start_backend().variant}
@@ -430,7 +430,7 @@ def _of_image(content: Content, options: RendererOptions, view: ImageView) -> Re
 def _render(
     content: Content, scene: MitsubaScene, options: RendererOptions, view: ImageView, rows: list[int]
 ) -> Frame:
-    """Rows of a view, with the bits that they have in the whole image."""
+    """Render rows of a view, with the same bits as in the whole image."""
     sequence = content.sequence
     poses = row_poses(sequence.rig, sequence.shutter, sequence.motion, view.side, view.frame)
     return render_view(scene, sequence, view, poses, _of_image(content, options, view), rows=rows)

@@ -1,4 +1,4 @@
-"""Frames of a sensor that is not ideal, against clean twins: no more blur and noise than the sensor makes."""
+"""Check frames with sensor effects against clean twins: blur and noise must be those that the sensor makes."""
 
 from __future__ import annotations
 
@@ -41,33 +41,33 @@ from rsbench.verification.reprojection import BoolArray, DepthMap
 
 _BLOCK = 8
 _MOST, _MOST_OF_ROWS = 0.02, 0.1
-"""Share of the values of an image, or of a row of pixels or blocks, that may be otherwise. Sound: none of a
-mosaic; of JPEG up to 1.2e-2 at quality 20, 1e-3 at 90."""
+"""Largest share of wrong values in an image, and in a row of pixels or blocks. In sound data no value of a mosaic
+is wrong; of JPEG up to 1.2e-2 at quality 20, 1e-3 at 90."""
 _LEAST, _LEAST_OF_ROWS = 200, 20
-"""Smallest numbers of values from which an image, or a row, is judged."""
+"""Smallest numbers of values with which an image, or a row, is judged."""
 _NEAR = 1.5
-"""Codes by which a value may differ from the mean of its neighbours. All are rounded by half a code; in the mean
-that of a bright neighbour counts up to twice."""
+"""Tolerance in codes between a value and the mean of its neighbours. All are rounded by half a code; in the mean,
+the rounding of a bright neighbour counts up to twice."""
 _COARSE, _OFF = 4, 1.25
-"""The smallest step at which a coefficient is judged, and how far it may be from whole steps: six standard
-deviations of the errors by rounding to codes, if these are independent. A third of the coefficients that were not
-rounded to a step of 4 are farther off. If values of a block repeat, as in equal rows, their rounding errors add
-up: the limit is multiplied by the root of the number of repetitions."""
+"""The smallest quantisation step at which a coefficient is judged, and its tolerance from a multiple of the step:
+six standard deviations of the errors by rounding to codes, if these are independent. A third of the coefficients
+that were not quantised with a step of 4 exceed it. If values of a block repeat, as in equal rows, their rounding
+errors add up: the tolerance is multiplied by the root of the number of repetitions."""
 _OPEN = 125.0
-"""Luminance about grey beyond which it may have been cut off."""
+"""Luminance relative to grey beyond which it may have been clipped."""
 _FIRST = 1.0 / np.sqrt(2.0)
 _DCT = 0.5 * np.cos(np.pi / 16 * np.outer(np.arange(8), 2 * np.arange(8) + 1)) * np.array([[_FIRST], *[[1.0]] * 7])
 """Orthonormal discrete cosine transform of eight values (ITU-T T.81, A.3.3)."""
 
 
 class _Counts(NamedTuple):
-    """For each row of pixels (H,): how many values are wrong, and how many can be judged."""
+    """Numbers of wrong values, and of values that can be judged, in each row of pixels (H,)."""
 
     wrong: FloatArray
     judged: FloatArray
 
     def rows(self) -> NDArray[np.bool_]:
-        """(H,) those in which too many are wrong; none where too few values can be judged."""
+        """Return the rows (H,) with too many wrong values; none if too few values can be judged."""
         bad = (self.wrong > _MOST_OF_ROWS * self.judged) & (self.judged >= _LEAST_OF_ROWS)
         if np.sum(self.judged) >= _LEAST and np.sum(self.wrong) > _MOST * np.sum(self.judged):
             bad |= self.wrong > _MOST * self.judged
@@ -75,15 +75,15 @@ class _Counts(NamedTuple):
 
 
 def processing_fault(image: NDArray[np.uint8], sensor: Sensor, file: str) -> Finding | None:
-    """An image (H, W, 3) that is not compressed or interpolated as its sensor's are; None where nothing shows it.
+    """Return a finding if an image (H, W, 3) lacks the compression or mosaic of its sensor; None if unclear.
 
-    Compressed images do not show a mosaic any more.
+    The mosaic of compressed images is not checked, as it no longer shows.
     """
     if sensor.jpeg_quality:
         blocks = _Blocks.of(image)
         if not np.any(wrong := blocks.off_steps(sensor.jpeg_quality).rows()):
             return None
-        # The coarsest that fits: whole steps of 8 are those of 4 too.
+        # Take the coarsest quantisation that fits: multiples of 8 are multiples of 4 too.
         like = next((q for q in range(1, 100) if _fits(blocks.off_steps(q))), None)
         what = f"is no JPEG image of quality {sensor.jpeg_quality}: its blocks are not of whole steps"
         return Finding(
@@ -102,7 +102,7 @@ def _fits(counts: _Counts) -> bool:
 
 
 def _not_means(image: NDArray[np.uint8], mosaic: Mosaic) -> _Counts:
-    """Interpolated values that are not the mean of the neighbours behind filters of their colour."""
+    """Count interpolated values that are not the mean of the neighbours with a filter of their colour."""
     height, width = image.shape[:2]
     light, codes = linear_of_codes(image), image.astype(np.float64)
     own = filters(mosaic, width, np.arange(height))
@@ -115,7 +115,7 @@ def _not_means(image: NDArray[np.uint8], mosaic: Mosaic) -> _Counts:
             for kernel in _KERNELS
         )
         level, upright = (np.any(own == channel, axis=axis, keepdims=True) for axis in (1, 0))
-        # The camera chose one of two directions by numbers that rounding has changed since: either is right.
+        # The camera chose one of two directions from values before their rounding, so either is accepted.
         right = np.where(level | upright, (across & level) | (down & upright), corners)
         judged = inner & (own != channel)
         wrong += np.sum(judged & ~right, axis=1)
@@ -134,16 +134,16 @@ _KERNELS = [
 
 
 class _Blocks(NamedTuple):
-    """The whole blocks of an image, (H / 8, W / 8, ...)."""
+    """The complete 8 x 8 blocks of an image, (H / 8, W / 8, ...)."""
 
     coefficients: FloatArray
-    """(..., 8, 8) of luminance."""
+    """(..., 8, 8) DCT coefficients of luminance."""
     open: NDArray[np.bool_]
-    """(...) whether no value in them is cut off at black or white."""
+    """(...) whether no value of the block is clipped at black or white."""
     distinct: NDArray[np.int64]
-    """(...) how many values of luminance they have."""
+    """(...) number of distinct values of luminance in the block."""
     rows: int
-    """Rows of pixels in the image."""
+    """Number of rows of pixels in the image."""
 
     @classmethod
     def of(cls, image: NDArray[np.uint8]) -> _Blocks:
@@ -156,7 +156,7 @@ class _Blocks(NamedTuple):
         return cls(_DCT @ luminance @ _DCT.T, np.all(open_, axis=(2, 3)), distinct, len(image))
 
     def off_steps(self, quality: int) -> _Counts:
-        """Coefficients that are not whole steps."""
+        """Count coefficients that are not multiples of their quantisation step."""
         steps = quality_steps(quality)
         allowed = _OFF * np.sqrt(_BLOCK**2 / self.distinct)[..., None, None]
         off = np.abs(self.coefficients - steps * np.round(self.coefficients / steps)) > allowed
@@ -169,33 +169,33 @@ class _Blocks(NamedTuple):
 
 @cache
 def quality_steps(quality: int) -> FloatArray:
-    """Steps (8, 8) of the coefficients of luminance, as OpenCV's encoder writes them."""
+    """Return the quantisation steps (8, 8) of luminance that OpenCV's encoder uses."""
     _, data = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
     with Image.open(io.BytesIO(data.tobytes())) as image:
         return np.array(image.quantization[0], dtype=np.float64).reshape(8, 8)
 
 
 _BEYOND_SIGMA, _BEYOND_SHARE, _ROW_SHARE = 5.0, 5e-3, 0.1
-"""A share of 6e-7 of Gaussian noise lies beyond, and more of Poisson noise in the dark; a blur sees what lies
-between the samples of a texture finer than a pixel, or behind a thin near edge, which the twin does not show. This
-share is for four samples, and grows with the distance between them."""
+"""Tolerance in sigma, and shares of the values of an image and of a row that may exceed it: 6e-7 of Gaussian
+noise, more of Poisson noise in the dark; a blur also contains texture between the twin's samples, and surfaces
+behind thin near edges. The first share is for four samples per pixel, and grows with the distance between them."""
 _LEAST_VALUES, _VARIANCE_RANGE = 1000, (0.85, 1.2)
-"""The variance of 1000 values is known to 4.5 %; five times that, and what a smooth surface changes in a blur."""
+"""The variance of 1000 values is known to 4.5 %; the range also allows for blur of a smooth surface."""
 _COMPRESSED_RANGE, _BLOCKS_ALIKE = (0.5, 2.0), 10
-"""Variance of a compressed image over that of the clean twin after the same compression; its noise is that of
-blocks, not of values: both numbers are chosen, not measured."""
+"""Allowed ratio of variances of a compressed image and of its clean twin after the same compression; factor on the
+number of values, as noise is that of blocks, not of values: both are chosen, not measured."""
 _JPEG_REACH = 17
-"""Pixels over which JPEG spreads what it leaves out: a block of colours of half the resolution, and one more."""
+"""Pixels over which JPEG spreads its errors: a block of colours at half the resolution, and one more."""
 _MOST_BIAS = 0.75
-"""Largest difference of the means, in sigma: where the twin is uneven by less than one sigma, its middle is off by
-half at most."""
+"""Largest difference of the means, in sigma: where the twin varies by less than one sigma, the middle of its range
+errs by at most half."""
 _FARTHER = 3
 _UNCLIPPED = (0.03, 0.75)
 _WHITE = 255.0
 
 
 def sensor_faults(content: Content, missing: Collection[str]) -> Iterator[Finding]:
-    """What the frames of a sequence show that their sensor cannot have made of the clean twins."""
+    """Find frames that their sensor cannot have made from the clean twins."""
     sequence, maps, pictures = content.sequence, content.maps, content.pictures
     sensor = sequence.sensor
     for view in pictures:
@@ -219,15 +219,15 @@ def sensor_faults(content: Content, missing: Collection[str]) -> Iterator[Findin
 
 
 def _spacing(sequence: Sequence) -> float:
-    """Pixels between the samples of the clean twin, which shows nothing that lies between."""
+    """Return the distance in pixels between samples of the clean twin, which does not show what lies between."""
     renderer = sequence.manifest.get("renderer")
     samples = renderer.get("samples") if isinstance(renderer, dict) else None
     return float(samples**-0.5) if isinstance(samples, int) and samples > 0 else 1.0
 
 
 def _changing(sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: float) -> BoolArray:
-    """(H, W) where no window holds while the row is exposed: an object that moves, or its shadow, or what a glossy
-    surface mirrors may be seen there."""
+    """Return the pixels (H, W) where ``_window`` does not hold during exposure: a moving object, its shadow, or
+    a reflection in a glossy surface may be seen there."""
     labels, gloss, found = depth_map.labels, depth_map.gloss, np.zeros(depth_map.depth.shape, dtype=np.bool_)
     beside = int(sensor.mosaic != "none") + (_JPEG_REACH if sensor.jpeg_quality else 0)
     if gloss is not None and sensor.exposure_s:
@@ -236,7 +236,7 @@ def _changing(sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: 
         return found
     numbers = range(1, len(sequence.moving) + 1)
     windows = [_window(sequence, sensor, depth_map, spacing, number) for number in numbers]
-    # A shadow goes about as far as what throws it; where the sun is low, or the ground is near, farther.
+    # A shadow moves about as far as the object that casts it, and farther if the sun is low or the ground is near.
     farthest = tuple(_FARTHER * np.max(windows, axis=0))
     masks = [numbers_of(labels) == number for number in numbers]
     for own, window in zip((*masks, labels >= SHADED), (*windows, farthest), strict=True):
@@ -245,7 +245,7 @@ def _changing(sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: 
 
 
 def _around(own: BoolArray, window: tuple[int, int], beside: int) -> BoolArray:
-    """(H, W) what lies within a window (x, y) of pixels, and some more."""
+    """Return which pixels (H, W) lie within a window (x, y), and ``beside`` pixels more, of a mask."""
     x, y = window
     around = np.ones((2 * (y + beside) + 1, 2 * (x + beside) + 1), np.uint8)
     return np.asarray(cv2.dilate(own.astype(np.uint8), around) > 0)
@@ -254,9 +254,9 @@ def _around(own: BoolArray, window: tuple[int, int], beside: int) -> BoolArray:
 def _window(
     sequence: Sequence, sensor: Sensor, depth_map: DepthMap, spacing: float, number: int = 0
 ) -> tuple[int, int]:
-    """How far (x, y) a surface may be, in whole pixels, from where the row's time sees it, while it is exposed.
+    """Return how far (x, y), in whole pixels, a surface may be during exposure from its place at the row's time.
 
-    Of the surfaces of an object, by its ``number``, or of what stands still.
+    Only surfaces of the object with this ``number`` count; 0 is the static scene.
     """
     view, labels = depth_map.view, depth_map.labels
     grid = depth_map.camera.pixel_grid()[::4, ::4]
@@ -275,7 +275,7 @@ def _window(
     moved = [
         np.abs(project_at(rig, motion, view.side, tau + sign * half, X)[..., :2] - grid) for sign in (-1.0, 1.0)
     ]
-    # One more: a pixel is an area, and thin near things lie between the points looked at; and between samples.
+    # Add one, as a pixel is an area and thin near objects lie between the tested points; add the sample spacing.
     x, y = np.ceil(np.nanmax(np.stack(moved), axis=(0, 1))).astype(int) + 1 + int(spacing)
     return int(x), int(y)
 
@@ -288,9 +288,9 @@ def _fault(
     spacing: float = 0.5,
     changing: BoolArray | None = None,
 ) -> Finding | None:
-    """What is wrong with an image of ``picture``'s view; ``window`` is how far (x, y) its blur may reach, px.
+    """Return the fault of an image of ``picture``'s view; ``window`` is how far (x, y) its blur may reach, px.
 
-    ``changing`` (H, W) where it may reach farther.
+    ``changing`` (H, W) marks pixels where it may reach farther; their light and noise are not judged.
     """
     bounds = _Bounds.of(sensor, image, picture, window, spacing)
     judged = np.ones((*image.shape[:2], 1), np.bool_) if changing is None else ~changing[..., None]
@@ -303,18 +303,18 @@ def _fault(
 
 @dataclass(frozen=True, eq=False)
 class _Bounds:
-    """What a sensor may show, linear values (H, W, 3) where white is 1."""
+    """Bounds on what a sensor may show, linear values (H, W, 3) where white is 1."""
 
     low: FloatArray
-    """The darkest and the brightest light that may come to a pixel."""
+    """The darkest light that may reach a pixel; ``high`` is the brightest."""
     high: FloatArray
     own: FloatArray
     """Variance of the sensor's noise."""
     rounded: FloatArray
-    """Variance by rounding, and by the noise of the twin."""
+    """Variance due to rounding, and to the noise of the twin."""
     slack: FloatArray
     inner: tuple[slice, slice]
-    """Pixels to which nothing comes from beyond the borders, which the twin does not show."""
+    """Pixels that receive no light from beyond the image border, which the twin does not show."""
 
     @classmethod
     def of(
@@ -332,9 +332,9 @@ class _Bounds:
         share = fall_off(sensor, width, height, np.arange(height))[..., None]
         least, most = (extreme(clean, around) for extreme in (cv2.erode, cv2.dilate))
         low = linear_of_codes(least) * share
-        # How bright white is, the twin does not say.
+        # The twin is clipped at white, so that the true brightness of white is unknown.
         high = np.where(most < _WHITE, np.minimum(linear_of_codes(most) * share, 1.0), 1.0)
-        # A path tracer's noise is in both, and in each frame another; one sample of a pixel is a draw likewise.
+        # A path tracer's noise differs between the frame and its twin; so does a single sample per pixel.
         traced = 12.0 * picture.noise**2 if picture.noisy or spacing >= 1.0 else 0.0
         own = sensor.variance(high)
         rounded = (1.0 + traced) * (_rounding(image) + share**2 * _rounding(clean))
@@ -364,8 +364,8 @@ def _beyond(
 def _noise_fault(
     bounds: _Bounds, sensor: Sensor, image: NDArray[np.uint8], picture: Picture, judged: BoolArray
 ) -> Finding | None:
-    """Light and noise where the twin is smooth. Rounding is no noise: without any beside it, equal values are
-    rounded alike."""
+    """Check light and noise where the twin is smooth and the noise exceeds rounding: without noise, equal values
+    are rounded alike."""
     low, high, view = bounds.low, bounds.high, picture.view
     sigma = np.sqrt(bounds.own + bounds.rounded)
     smooth = judged & (high - low < sigma) & (low > _UNCLIPPED[0]) & (high < _UNCLIPPED[1])
@@ -392,7 +392,7 @@ def _noise_fault(
 
 
 def _file(view: ImageView) -> str:
-    """What the sensor made."""
+    """Return the file of the image that the sensor made."""
     return view.image if view.shutter == "rs" else view.exposed
 
 
@@ -401,7 +401,7 @@ def _twin(view: ImageView) -> str:
 
 
 def _made_of(clean: NDArray[np.uint8] | NDArray[np.float32], sensor: Sensor) -> NDArray[np.uint8]:
-    """What the sensor makes of the light of a clean twin, with noise of its kind."""
+    """Return the image that the sensor makes of a clean twin, with new random noise."""
     rows = range(len(clean))
     light = linear_of_codes(clean).astype(np.float32)
     return processed(
@@ -410,7 +410,7 @@ def _made_of(clean: NDArray[np.uint8] | NDArray[np.float32], sensor: Sensor) -> 
 
 
 def _compression(sensor: Sensor, clean: NDArray[np.uint8] | NDArray[np.float32]) -> FloatArray:
-    """Variance (H, W, 3) of linear values by JPEG, near each pixel: of the clean twin behind the same sensor."""
+    """Return the variance (H, W, 3) of linear values near each pixel that JPEG adds to the sensor's image."""
     before = _made_of(clean, replace(sensor, jpeg_quality=0))
     after = compressed(before, sensor.jpeg_quality)
     error = (linear_of_codes(after) - linear_of_codes(before)) ** 2
@@ -418,13 +418,13 @@ def _compression(sensor: Sensor, clean: NDArray[np.uint8] | NDArray[np.float32])
 
 
 def _sampling(clean: NDArray[np.uint8] | NDArray[np.float32], spacing: float) -> FloatArray:
-    """Variance of linear values (...) that are means of 1 / spacing^2 samples of what the pixels around show."""
+    """Return the variance (...) of linear means of 1 / spacing^2 samples of what the surrounding pixels show."""
     around = np.ones((3, 3), np.uint8)
     least, most = (linear_of_codes(extreme(clean, around)) for extreme in (cv2.erode, cv2.dilate))
     return np.asarray((spacing * (most - least)) ** 2 / 12.0, dtype=np.float64)
 
 
 def _rounding(codes: NDArray[np.uint8] | NDArray[np.float32]) -> FloatArray:
-    """Variance of the linear values (...) by rounding to codes."""
+    """Return the variance of linear values (...) due to rounding to codes."""
     exact = codes.astype(np.float64)
     return np.asarray((linear_of_codes(exact + 0.5) - linear_of_codes(exact - 0.5)) ** 2 / 12.0, dtype=np.float64)

@@ -471,10 +471,10 @@ def correct_frame(
     sky_mask: NDArray[np.bool_] | None = None,
     options: WarpOptions | None = None,
 ) -> Corrected:
-    """Rolling-shutter frame (H, W[, C]) to the global-shutter image of the same camera at ``target_tau``.
+    """Correct a rolling-shutter frame (H, W[, C]) to the global-shutter image of its camera at ``target_tau``.
 
-    ``target_tau`` is in frame periods; by default that of the first line read. ``depth`` (H, W) and the errors
-    are those of ``warp``.
+    ``target_tau`` is in frame periods; by default the time of the first line read. ``depth`` (H, W) is as in
+    ``LineView``. Raises as ``warp`` does.
     """
     poses, target, columns = _poses(moving, view, target_tau)
     frame = LineView(image=image, depth=depth, poses=poses, columns=columns)
@@ -489,7 +489,7 @@ def correction_flow(
     target_tau: float | None = None,
     sky_mask: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
-    """Displacement (H, W, 2), px, that takes each rolling-shutter pixel to its place at ``target_tau``.
+    """Return the displacement (H, W, 2), px, of each rolling-shutter pixel to its position at ``target_tau``.
 
     ``x_target - x_source`` on the grid of the source; NaN where the depth is unknown or the point is behind the
     target camera. Arguments as in ``correct_frame``.
@@ -503,7 +503,7 @@ def correction_flow(
 
 
 def _poses(moving: MovingRig, view: View, target_tau: float | None) -> tuple[Pose, Pose, bool]:
-    """Poses of a frame's lines and of its target, and whether lines are columns."""
+    """Return the poses of a frame's lines, the target pose, and whether lines are columns."""
     rig, shutter, motion, (side, frame) = moving.rig, moving.shutter, moving.motion, view
     target = rig.cam_from_world(motion, _target_time(shutter, side, frame, target_tau), side)
     return row_poses(rig, shutter, motion, side, frame), target, shutter.axis(side) == 0
@@ -517,7 +517,7 @@ def _target_time(shutter: RollingShutter, side: Side, frame: int, target_tau: fl
 
 
 def depth_of(buffer: F32) -> F32:
-    """Depth (...) of inverse depths (...) of ``drawn``; NaN where the frame did not see the target."""
+    """Convert inverse depths (...) of ``drawn`` to depths; NaN where the frame did not see the target."""
     depth = np.full(buffer.shape, np.nan, dtype=np.float32)
     with np.errstate(divide="ignore"):  # at infinity
         return np.divide(np.float32(1.0), buffer, out=depth, where=buffer >= 0.0)

@@ -1,4 +1,4 @@
-"""The contract of correctors, rolling-shutter frames to global-shutter ones, and how they are found by name."""
+"""The interface of correctors, which convert rolling-shutter frames to global-shutter ones; loading by name."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ Depths = Mapping[View, NDArray[np.float32]]
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectorSpec:
-    """What a corrector declares, checked when it is made. Raises ValueError on unknown values."""
+    """Requirements and properties that a corrector declares. Raises ValueError on unknown values."""
 
     needs: Set[Knowledge]
-    """What the chain must estimate for it first; what is not needed is not estimated. Gyroscope samples cannot be
-    estimated: without them the frames are refused."""
+    """Quantities that the chain must estimate before the correction; others are not estimated. Gyroscope samples
+    cannot be estimated: frames without them are refused."""
     reference: str
-    """Where it was published."""
+    """The publication of the method."""
     assumes: str
-    """What must hold for it to work, in words."""
+    """Assumptions of the method, as text."""
     cameras: Cameras = "ideal"
-    """Others are refused. ``ideal``: no lens, and both cameras read rows from the top at one time. ``any``: two
-    equal, aligned cameras with a lens and any scan. ``rig``: any two cameras."""
+    """Supported cameras; others are refused. ``ideal``: no lens, both cameras read rows from the top at one time.
+    ``any``: two equal, aligned cameras with or without lens, any scan. ``rig``: any two cameras."""
     sees: Set[OtherFrames] = frozenset(get_args(OtherFrames))
-    """Which other frames it uses, itself or through what it needs: the other camera's (``stereo``), those of the
-    other ``time``. The chain's matches are checked in both."""
+    """Other frames that are used, directly or by ``needs``: the other camera's (``stereo``), those of the other
+    frame time (``time``). Needs other than ``gyro`` require both, as the chain's matches are checked in both."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "needs", frozenset(self.needs))
@@ -68,33 +68,33 @@ class CorrectorSpec:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CorrectionProblem:
-    """Four frames and what is known of them."""
+    """The input of a corrector: four frames, with known or estimated quantities."""
 
     images: Mapping[View, NDArray[Any]]
     """(H, W) grey or (H, W, 3) RGB of one type, uint8 or uint16, each of its camera's size."""
     rig: StereoRig
     shutter: RollingShutter
     target_row: float
-    """A corrected frame shows the time at which its camera had read this many lines: a row, from the top. In rigs
-    of two sizes or readout ratios these are the left camera's lines."""
+    """A corrected frame shows the scene at the time when its camera has read this many lines. If the cameras
+    differ in size or readout ratio, lines of the left camera are counted."""
     motion: Motion | None
-    """Motion of the rig's body, metres; None when the corrector does not need it."""
+    """Motion of the rig's body, metres; None if the corrector does not need it."""
     depth: Depths | None
-    """(H, W) metres in each row's own camera; inf at infinity, 0 unknown. None when the corrector does not need
-    it."""
+    """(H, W) metres, in the camera at the time of each row; inf at infinity, 0 unknown. None if the corrector does
+    not need it."""
     guess: Depths | None
-    """(H, W) the same, guessed from the neighbours where ``depth`` is unknown; 0 elsewhere."""
+    """(H, W) metres, guessed from neighbours where ``depth`` is unknown; 0 elsewhere."""
     disparity_offset: float = 0.0
-    """px by which disparities in the images are too large, half of it in either camera; ``depth`` is without."""
+    """px by which disparities in the images are too large, half of it per camera; not contained in ``depth``."""
     matches: Correspondences | None = None
-    """Matches of the four frames, outliers included; None when the corrector does not need them."""
+    """Matches of the four frames, with outliers; None if the corrector does not need them."""
     gyro: FloatArray | None = None
-    """(n, 4) tau, w: samples of a gyroscope, as in ``Correspondences``; None when it does not need them."""
+    """(n, 4) tau, w: gyroscope samples as in ``Correspondences``; None if the corrector does not need them."""
     one_time: bool = False
-    """Whether the corrected frames of both cameras show the time of the left one's, where theirs differ."""
+    """Whether corrected frames of both cameras show the target time of the left one, if the times differ."""
 
     def camera(self, side: Side, reference: Side) -> PinholeCamera:
-        """Camera of one side, in pixels in which the images of ``reference`` have the rig's principal point."""
+        """Return a camera, with its principal point shifted by the disparity offset unless it is ``reference``."""
         camera = self.rig.sensor(side)
         if side == reference or self.disparity_offset == 0.0:
             return camera
@@ -102,18 +102,18 @@ class CorrectionProblem:
         return replace(camera, cx=camera.cx + shift)
 
     def row_poses(self, view: View) -> Pose:
-        """``cam_from_world`` (lines, 3, 3), (lines, 3) of every line of a frame, a row or a column.
+        """Return ``cam_from_world`` (lines, 3, 3), (lines, 3) of every line (row or column) of a frame.
 
         Raises ValueError without a motion.
         """
         return projection.row_poses(self.rig, self.shutter, self._motion(), *view)
 
     def target_pose(self, view: View) -> Pose:
-        """``cam_from_world`` of the corrected frame. Raises ValueError without a motion."""
+        """Return ``cam_from_world`` of the corrected frame. Raises ValueError without a motion."""
         return self.rig.cam_from_world(self._motion(), self.target_time(view), view[0])
 
     def target_time(self, view: View) -> FloatArray:
-        """Time of the corrected frame: where rows differ, as long after its start as in the left camera."""
+        """Return the time of the corrected frame; see ``target_row`` and ``one_time``."""
         side, frame = ("left" if self.one_time else view[0]), view[1]
         if side == "left" or (self.shutter.right_readout_ratio, self.shutter.right_size) == (None, None):
             return self.shutter.time_after(self.target_row, frame, side)
@@ -131,23 +131,23 @@ class Corrector(ABC):
     @property
     @abstractmethod
     def spec(self) -> CorrectorSpec:
-        """What it declares; a class attribute where the parameters do not change it."""
+        """The declared properties; a class attribute if they do not depend on parameters."""
 
     @abstractmethod
     def correct(self, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
-        """The corrected frames of the requested views, with where each pixel comes from.
+        """Return the corrected frames of the requested views, with the origin of each pixel.
 
-        Images keep the shape and type of the given ones. A frame that cannot be corrected is ``Fused.failed`` with
-        the reason: a value, never an exception or the frame as it was.
+        Images keep their shape and type. For a frame that cannot be corrected, return ``Fused.failed`` with the
+        reason: do not raise an exception, and do not return the uncorrected frame.
         """
 
     def correct_rows(
         self, problem: CorrectionProblem, views: Sequence[View], rows: Sequence[float]
     ) -> list[dict[View, Fused]]:
-        """``correct`` at the times of several target rows, in place of the problem's.
+        """Call ``correct`` for several target rows in place of that of the problem.
 
-        Override it where the expensive part does not depend on the row. It is not called for correctors of other
-        packages, which run in processes of their own.
+        Override it if the expensive part does not depend on the row. It is not called for correctors of other
+        packages, which run in separate processes.
         """
         return [self.correct(replace(problem, target_row=row), views) for row in rows]
 
@@ -156,7 +156,7 @@ CorrectorEntry = Entry[Corrector, RunOptions]
 
 
 class NotCorrectedError(RsbenchError):
-    """The frames are in order, but the corrector found no correction of them; the message says why."""
+    """Raised if the frames are valid but the corrector cannot correct them; the message gives the reason."""
 
 
 def _check_spec(corrector: Corrector) -> None:
@@ -170,26 +170,26 @@ CORRECTORS: Kind[Corrector, RunOptions] = Kind(
 
 
 def load_corrector(name_or_path: str | Path) -> CorrectorEntry:
-    """A corrector by the name of a card or entry point, or by the path of a card.
+    """Load a corrector by the name of a card or entry point, or by the path of a card.
 
     Raises:
-        RsbenchError: no such corrector, two of that name, or its card or class is wrong.
+        RsbenchError: the corrector does not exist, two have this name, or its card or class is wrong.
     """
     return plugins.load_entry(CORRECTORS, name_or_path)
 
 
 def find_corrected(entry: CorrectorEntry, problem: CorrectionProblem, views: Sequence[View]) -> dict[View, Fused]:
-    """What a corrector makes of four frames, checked; errors as ``find_corrected_rows``."""
+    """Correct four frames and check the result; raises as ``find_corrected_rows`` does."""
     return find_corrected_rows(entry, problem, views, (problem.target_row,))[0]
 
 
 def find_corrected_rows(
     entry: CorrectorEntry, problem: CorrectionProblem, views: Sequence[View], rows: Sequence[float]
 ) -> list[dict[View, Fused]]:
-    """What a corrector makes of four frames at the times of several target rows, checked.
+    """Correct four frames to the times of several target rows and check the results.
 
     Raises:
-        RsbenchError: another package's corrector raised, or answered something else: one line with its name.
+        RsbenchError: the cameras are not supported, another package's corrector failed, or a result is wrong.
     """
     where = f"{CORRECTORS.singular} {entry.name!r}"
     check_cameras_of(entry.component.spec.cameras, problem.rig, problem.shutter, where)
@@ -206,10 +206,10 @@ def find_corrected_rows(
 
 
 def demand_corrected(frames: Mapping[View, Fused], corrector: str) -> None:
-    """Refuse frames of which some have no correction, for callers that need all of them.
+    """Check that all frames were corrected, for callers that need all of them.
 
     Raises:
-        NotCorrectedError: one of them has failed; names the corrector, the first such frame and the reason.
+        NotCorrectedError: the message names the corrector, the first failed frame and the reason.
     """
     for (side, frame), fused in frames.items():
         if not fused.success:

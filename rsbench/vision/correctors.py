@@ -46,8 +46,8 @@ _MOVED_PX = 2.0
 _DISPARITY_PX = 1.0
 """Relative error of depth by which a static point may be farther or nearer."""
 _NOISE_LEVELS, _CLEARLY = 1.0, 0.7
-"""Difference of grey levels that is always tolerated, and the share of the difference at the place by geometry
-that the place by flow may have."""
+"""Flow is clearly better if its difference of grey levels, plus the first value, is below the second value times
+the difference at the position by geometry."""
 _AROUND = 1 / 16
 """Side of the window in which both places are compared, as a share of the image's width."""
 _MEDIAN = 9
@@ -57,8 +57,8 @@ _LEAST, _SEEN = 0.004, 0.1
 and as a share of the region that then moves along its flow."""
 _TEXTURE_LEVELS, _BESIDE, _MOST, _FEW = 4.0, 5, 0.95, 0.01
 """Least standard deviation of grey levels around a pixel whose flow is trusted; side, px, of the window in which
-it may be on a curve; share of such flow on the curves that is the most to be expected, and share of the image with
-such flow below which it says nothing."""
+it may be on a curve; share of such flow on the curves above which all counts as explained; least share of the
+image with such flow for a conclusion."""
 _EDGE = 7
 """Side, px, of the window whose nearest surface may hide a point: depth has errors at edges."""
 _SMALLEST = 12
@@ -86,7 +86,7 @@ class _Still(NamedTuple):
     """Whether the point's depth is unknown."""
 
     def nearest(self, flow: F32) -> F32:
-        """(H, W, 2) displacement, px, between both that is nearest to the ``flow`` (H, W, 2)."""
+        """(H, W, 2) displacement, px, between ``far`` and ``near`` that is closest to the ``flow`` (H, W, 2)."""
         along = self.near - self.far
         share = np.sum((flow - self.far) * along, axis=-1)
         share /= np.maximum(np.sum(along * along, axis=-1), np.float32(1e-6))
@@ -205,7 +205,7 @@ def _explained(
     on = cv2.dilate(on, np.ones((_BESIDE, _BESIDE), np.uint8)) > 0
     used = (local_variance(greys[0]) > _TEXTURE_LEVELS**2) & ~still.unknown & ~leaves(flow)
     if evidence is not None and 2 * np.count_nonzero(used & evidence) < np.count_nonzero(used):
-        used &= ~evidence  # what moves in most of the image is the rig
+        used &= ~evidence  # evidence in most of the image is due to the rig's motion
     if np.count_nonzero(on & used) >= _MOST * np.count_nonzero(used):
         return 1.0
     used &= returns_px(flow, back()) < 0.5 * RETURNS_PX
@@ -240,8 +240,10 @@ def _around(evidence: Mask, share: F32) -> F32:
 def _clearly_better(
     greys: Sequence[NDArray[np.uint8]], flow: F32, still: F32, judged: Mask, outside: Mask
 ) -> Mask:
-    """(H, W) whether in the ``judged`` pixels (H, W) around one, ``flow`` (H, W, 2), px, leads to a place that
-    looks clearly more similar than that of ``still``; if that is ``outside`` (H, W), than the mean around it."""
+    """Mask (H, W) of pixels around which ``flow`` (H, W, 2), px, clearly gives smaller differences than ``still``.
+
+    Means over the ``judged`` pixels (H, W) in a window are compared. For pixels whose ``still`` position is
+    ``outside`` (H, W), the difference to the mean around the pixel is used."""
     window = (round(_AROUND * flow.shape[1]) | 1,) * 2
     weight = judged.astype(np.float32)
     there = _unlike(greys, np.nan_to_num(still), window)
@@ -252,8 +254,8 @@ def _clearly_better(
 
 
 def _unlike(greys: Sequence[NDArray[np.uint8]], flow: F32, window: tuple[int, int]) -> F32:
-    """(H, W) difference of grey levels between a frame and the other one at the end of ``flow`` (H, W, 2), px,
-    less its mean in the window: smooth surfaces show neither their place nor their brightness."""
+    """(H, W) absolute difference of grey levels between a frame and the other one at the end of ``flow`` (H, W,
+    2), px, after subtraction of its mean in the window, so that differences of brightness do not count."""
     apart = followed(greys[1], flow, cv2.BORDER_REPLICATE).astype(np.float32) - greys[0]
     return np.asarray(np.abs(apart - cv2.blur(apart, window)))
 
@@ -273,7 +275,7 @@ def draw_moving(
 
     Args:
         fused: the frame without them, see ``find_moving``.
-        image, depth: (H, W[, 3]), (H, W) of the frame of the ``view``; depth includes guesses.
+        image, depth: (H, W[, 3]) and (H, W) of the frame ``view``; the depth includes guesses.
         moving: the objects in that frame.
         maps: of the frame's lines to the target.
         target_tau: time of the corrected frame, frame periods.
@@ -389,7 +391,7 @@ class FusionCorrector(Corrector):
         ]
 
     def _placed(self, problem: CorrectionProblem, view: View, source: SourceView) -> SourceView:
-        """The frame with a depth in those lines where any depth moves a pixel by less than ``tear_px``."""
+        """Guess unknown depth in lines where any plausible depth moves pixels by less than ``tear_px``."""
         known = source.depth[source.depth > 0.0]
         if problem.guess is None or known.size == 0:
             return source
@@ -401,7 +403,7 @@ class FusionCorrector(Corrector):
 
 
 def _standing(problem: CorrectionProblem, moving: Mapping[View, Moving]) -> CorrectionProblem:
-    """Depth without that of moving objects."""
+    """Set the depth of moving objects to unknown."""
 
     def still(depth: Depths | None) -> Depths | None:
         if depth is None:
@@ -469,8 +471,8 @@ def plane_depth(depth: NDArray[Any], camera: PinholeCamera | None = None) -> F32
     """Depth (H, W) of the plane that fits a depth map (H, W) best: inverse depth affine in the (ideal) pixel.
 
     Iterated least squares on absolute differences, so that the larger surface wins; 0 and NaN are unknown, inf is
-    infinitely far. Where the plane lies behind the camera the result is inf. A correction with it is a homography
-    per row. ``camera`` matters where it has a lens.
+    infinitely far. The result is inf where the plane lies behind the camera. A correction with it is a homography
+    per row. ``camera`` is needed only if it has a lens.
     """
     height, width = depth.shape
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height))
@@ -492,7 +494,7 @@ def plane_depth(depth: NDArray[Any], camera: PinholeCamera | None = None) -> F32
 
 
 def turned(problem: CorrectionProblem, view: View, options: WarpOptions) -> Fused:
-    """A frame moved only by the rotation of the problem's motion: everything is at infinity."""
+    """Correct a frame by the rotation of the problem's motion alone: all depth is infinite."""
     camera = problem.rig.sensor(view[0])
     far = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
     return _alone(problem, view, far, options)

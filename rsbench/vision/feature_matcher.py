@@ -1,4 +1,4 @@
-"""The contract of feature matchers, point correspondences of four images, and how they are found by name."""
+"""The interface of feature matchers, which find point correspondences of four images; loading by name."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rsbench.core.rig import SIDES, AlignedCamera, StereoRig, View
 from rsbench.core.so3 import FloatArray
 
 _FAR = -1e6
-"""Pixel of what the lens does not reach."""
+"""Pixel coordinate of rays beyond the reach of the lens."""
 
 _OUTSIDE_PX = 1.0
 """How far beyond the centre of the outermost pixel a sub-pixel position may lie."""
@@ -33,30 +33,30 @@ class FeatureMatcher(ABC):
 
     @abstractmethod
     def match(self, images: Mapping[View, NDArray[np.uint8]]) -> Correspondences:
-        """Matches between ``images["left", 0]``, ``["right", 0]``, ``["left", 1]`` and ``["right", 1]``.
+        """Match ``images["left", 0]``, ``["right", 0]``, ``["left", 1]`` and ``["right", 1]``.
 
-        Images (H, W) or (H, W, 3) RGB of one size; positions in pixels, the centre of the top-left one (0, 0).
-        Sets may come out empty; the solver says what it needs. ``tracks`` are points seen in all four images.
+        Images are (H, W) or (H, W, 3) RGB, of one size. Positions are in pixels; the centre of the top-left pixel
+        is (0, 0). Any set of the result may be empty. ``tracks`` are points that are visible in all four images.
         """
 
     def match_of_rig(self, images: Mapping[View, NDArray[np.uint8]], rig: StereoRig) -> Correspondences:
-        """``match`` of images of any cameras, in their pixels: of their images without lens and rotation."""
+        """Match images of any cameras, in their pixels; by default after removing lens distortion and rotation."""
         straight = {view: undistorted(image, rig.eye(view[0])) for view, image in images.items()}
         return of_sensors(self.match(straight), rig)
 
     def apart(self) -> Self | None:
-        """The same for cameras that do not read rows together, whose left-right matches may lie anywhere.
+        """Return this matcher for cameras that read a row at different times: left-right matches on any rows.
 
-        None: it may look along the row.
+        None (the default): the matcher may search along rows only.
         """
         return None
 
     def with_enough(self, tracks: int) -> Self:
-        """The same, which may give tracks alone where there are as many as that."""
+        """Return this matcher; it may then return tracks alone if it finds at least ``tracks`` of them."""
         return self
 
     def faster(self) -> Self | None:
-        """The same at half the size; None: it knows no other size."""
+        """Return this matcher for half the image size; None (the default): not supported."""
         return None
 
 
@@ -67,10 +67,10 @@ FEATURE_MATCHERS: Kind[FeatureMatcher, RunOptions] = Kind(
 
 
 def load_features(name_or_path: str | Path) -> FeatureEntry:
-    """A feature matcher by the name of a card or entry point, or by the path of a card.
+    """Load a feature matcher by the name of a card or entry point, or by the path of a card.
 
     Raises:
-        RsbenchError: no such feature matcher, two of that name, or its card or class is wrong.
+        RsbenchError: the feature matcher does not exist, two have this name, or its card or class is wrong.
     """
     return plugins.load_entry(FEATURE_MATCHERS, name_or_path)
 
@@ -78,13 +78,13 @@ def load_features(name_or_path: str | Path) -> FeatureEntry:
 def find_correspondences(
     entry: FeatureEntry, images: Mapping[View, NDArray[np.uint8]], rig: StereoRig | None = None
 ) -> Correspondences:
-    """What a feature matcher finds in four images, checked: finite positions inside the images.
+    """Match four images, and check that all positions lie inside the images.
 
     Args:
-        rig: whose cameras took the images; None: these are a rectified pair.
+        rig: the rig that took the images; None: the pairs are rectified.
 
     Raises:
-        RsbenchError: another package's matcher raised, or answered something else: one line with its name.
+        RsbenchError: another package's matcher raised an exception, or a matcher returned a wrong result.
     """
     where = f"{FEATURE_MATCHERS.singular} {entry.name!r}"
     with plugins.blame(FEATURE_MATCHERS, entry):
@@ -111,10 +111,10 @@ def find_correspondences(
 
 
 def undistorted(image: NDArray[Any], camera: PinholeCamera | AlignedCamera) -> NDArray[Any]:
-    """The image (H, W[, 3]) in ideal pixels, of the size of the ideal camera; cubic interpolation.
+    """Resample an image (H, W[, 3]) to ideal pixels, at the size of the ideal camera, by cubic interpolation.
 
-    What lies beyond the image is a mirror of its border: ``of_sensors`` drops matches there. Rows of the result
-    are not read at one time: times belong to the pixels of the image as it was.
+    Areas outside the image are filled by mirroring its border; ``of_sensors`` drops matches there. A row of the
+    result was not read at one time: readout times belong to the pixels of the original image.
     """
     if camera.is_ideal:
         return image
@@ -126,12 +126,12 @@ def undistorted(image: NDArray[Any], camera: PinholeCamera | AlignedCamera) -> N
 
 @lru_cache(maxsize=2 * len(SIDES))
 def _lens_pixels(camera: PinholeCamera | AlignedCamera) -> NDArray[np.float32]:
-    """(H, W, 2) pixels of the image at which all pixels of the ideal camera are; not to be written to."""
+    """(H, W, 2) positions of the ideal camera's pixels in the image. The result is cached: do not modify it."""
     return np.nan_to_num(camera.lens_pixels(camera.ideal.pixel_grid()), nan=_FAR).astype(np.float32)
 
 
 def of_sensors(matches: Correspondences, rig: StereoRig, border_px: float = 0.0) -> Correspondences:
-    """Matches in ideal pixels as pixels of the images; those outside or near the border are dropped."""
+    """Convert matches from ideal pixels to pixels of the images, without those outside or within ``border_px``."""
     if rig.rectified:
         return matches
     sets, kept = dict[str, FloatArray](), dict[str, NDArray[np.bool_]]()
@@ -153,6 +153,6 @@ def of_sensors(matches: Correspondences, rig: StereoRig, border_px: float = 0.0)
 
 
 def _inside(points: FloatArray, camera: PinholeCamera, border_px: float) -> NDArray[np.bool_]:
-    """Mask (n,) of points (n, 2), px, that the image holds with so much around them."""
+    """Mask (n,) of points (n, 2), px, that are inside the image and at least ``border_px`` from its border."""
     shifts = [np.array([x, y]) for x in (-border_px, border_px) for y in (-border_px, border_px)]
     return np.all([camera.contains(points + shift) for shift in shifts], axis=0)

@@ -411,7 +411,7 @@ class Recent(Generic[T]):
 
 
 def content_key(image: NDArray[Any]) -> Hashable:
-    """Equal for images of equal size, type and content."""
+    """Return a key that is equal for images of equal size, type and content."""
     digest = hashlib.blake2b(np.ascontiguousarray(image).data, digest_size=16).digest()
     return digest, image.shape, image.dtype.str
 

@@ -169,12 +169,12 @@ class _Points(NamedTuple):
     """(n[, C]), empty before ``coloured``."""
 
     def only(self, which: Mask) -> _Points:
-        """Those of the points (n,)."""
+        """Select points by a mask (n,)."""
         (y, x), rest = self.at, (each[which] for each in self[1:])
         return _Points((y[which], x[which]), *rest)
 
     def coloured(self, image: NDArray[Any], options: WarpOptions) -> _Points:
-        """With colours from the view's image."""
+        """Add colours from the view's image."""
         return self._replace(colour=resample_at(image, self.source, options.interpolation))
 
 
@@ -305,7 +305,7 @@ def _find_in_lines(
 def _warp_into(
     view: SourceView, holes: Mask, camera: PinholeCamera, target_pose: Pose, options: WarpOptions
 ) -> _Points:
-    """The pixels of the holes (H, W) that a view shows, without colours."""
+    """Find the pixels of the holes (H, W) that a view shows, without their colours."""
     maps = line_maps(camera, view.poses, target_pose, view.columns, view.camera)
     wanted = cv2.dilate(holes.astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8))
     depth = np.zeros_like(view.depth)
@@ -325,9 +325,9 @@ def _keep_landing(
     wanted: NDArray[np.uint8],
     kept: NDArray[np.float32],
 ) -> int:
-    """Copy to ``kept`` the depth (H, W) of pixels that are mapped to wanted target pixels (h, w); their number.
+    """Copy to ``kept`` the depth (H, W) of pixels that are mapped to ``wanted`` target pixels (h, w).
 
-    ``rho`` is inverse depth, NaN where unknown.
+    ``rho`` is inverse depth, NaN where unknown. Returns the number of these pixels.
     """
     height, width = wanted.shape
     count = 0
@@ -370,9 +370,9 @@ _FAR = 1e6
 
 
 def narrow(holes: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The parts of ``holes`` (H, W) that are closed: all but large regions that consist of discs of that width.
+    """Select the parts of ``holes`` (H, W) to close: all but large regions that consist of discs of that width.
 
-    Holes end at the border of the image.
+    The outside of the image does not belong to a hole.
     """
     size = max(round(_WIDTH_SHARE * holes.shape[1]), _LEAST_PX) | 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))

@@ -239,7 +239,7 @@ _BYTES = 1e9
 
 @contextmanager
 def single_opencv() -> Iterator[None]:
-    """OpenCV runs in one thread per call, for callers that run several calls at once; results do not change.
+    """Let OpenCV use one thread per call, for callers that run several calls in parallel; results do not change.
 
     Its own threads on top of theirs take a tenth more processor time (a video on two cores).
     """
@@ -255,8 +255,8 @@ def map_frames(work: Callable[[T], R], items: Iterable[T], pixels: int, bytes_pe
     """Apply ``work`` to each item in at least one and at most as many threads as there are cores.
 
     Args:
-        pixels: of one frame.
-        bytes_per_pixel: memory that one ``work`` needs while it runs, measured.
+        pixels: number of pixels of one frame.
+        bytes_per_pixel: measured memory that one call of ``work`` needs.
     """
     most = max(1, min(os.cpu_count() or 1, int(_BYTES / (pixels * bytes_per_pixel))))
     with ThreadPoolExecutor(most) as pool:

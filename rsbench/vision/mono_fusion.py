@@ -124,7 +124,7 @@ _BEHIND = 1.02
 _FLOW_BYTES = 100.0
 _BLOCK, _BLOCKS_AROUND = 8, 4
 """Side, px, of blocks of pixels that are moved only if their middle comes near a hole; and the largest distance to
-it, in blocks, which is more than one that is stretched by ``_STRETCH`` covers."""
+the hole, in blocks, which exceeds the extent of a block that is stretched by ``_STRETCH``."""
 
 
 class Flows(NamedTuple):
@@ -136,7 +136,7 @@ class Flows(NamedTuple):
     flow: tuple[F32, F32]
     """(h, w, 2) px, of each frame to the other."""
     returns: tuple[F32, F32]
-    """(h, w) px between a pixel and the end of its flow there and back, the flow of the border beyond it."""
+    """(h, w) result of ``returns_px``, px."""
     scale: tuple[float, float] = (1.0, 1.0)
     """W / w and H / h."""
 
@@ -177,9 +177,9 @@ class OwnMotion:
     """The camera and its motion over two frames."""
 
     rig: StereoRig
-    """Its body is where that camera is."""
+    """A rig whose body is at that camera."""
     shutter: RollingShutter
-    """Reads rows."""
+    """Its lines are rows."""
     side: Side
     motion: Motion | None
     """Motion, in its own unit of length; None: unknown, and every pixel moves along its flow."""
@@ -217,7 +217,7 @@ class Beyond(NamedTuple):
 
     pair: MonoFusion
     frame: int
-    """Which of both has the hole; the other one fills it."""
+    """Index of the frame with the hole; the other frame fills it."""
     target_tau: float
     """In frame periods of this pair."""
 
@@ -232,7 +232,7 @@ class MonoFusion:
         flows: Flows,
         options: MonoFusionOptions | None = None,
     ) -> None:
-        """Find the depth of both frames (H, W[, 3]), uint8 or uint16, of the motion ``own``."""
+        """Find the depth of both frames (H, W[, 3]), uint8 or uint16, by the motion ``own``."""
         self.images, self.own, self.flows, self.options = images, own, flows, options or MonoFusionOptions()
         self._layers = self._find_layers()
 
@@ -294,13 +294,13 @@ class MonoFusion:
     def _drawn(
         self, frame: int, moved: FloatArray, wanted: Mask | None = None
     ) -> tuple[NDArray[Any], F32, NDArray[np.uint8]]:
-        """Image (H, W[, C]), inverse depth and origin (H, W) of a frame with pixels at the places ``moved``.
+        """Draw a frame with its pixels at ``moved``: image (H, W[, C]), inverse depth (H, W) and origin (H, W).
 
-        HERE, GUESSED where it is stretched over an edge, and NOBODY, of inverse depth -1, where it shows nothing.
+        The origin is HERE, GUESSED where the frame is stretched over an edge, or NOBODY (inverse depth -1).
 
         Args:
             moved: (H, W, 3) see ``places``.
-            wanted: (H, W) pixels that are drawn, nowhere stretched; None: all.
+            wanted: (H, W) pixels that must be drawn, without stretching; None: all.
         """
         tears = self.own.motion is not None
         joined = joined_within(moved, _STRETCH if tears else np.inf)
@@ -358,8 +358,8 @@ def _place(
     """Target x, y, px, and inverse depth there, of a pixel: the mean of its places by scaled flow, with ``weight``
     (H, W), and by ``maps``; scaled flow alone if there are no maps.
 
-    ``ahead`` (H,) is the time from each row to the target. Rows are read evenly, ``rate`` each, so the time that
-    passes along the flow is a line in it; a flow that ends at the time where it began has no speed.
+    ``ahead`` (H,) is the time from each row to the target. Each row takes the time ``rate``, so the time that
+    passes along the flow is linear in the flow; if none passes, there is no speed, and the pixel stays.
     """
     passed = period + flow[y, x, 1] * rate
     share = ahead[y] / passed if abs(passed) > 1e-3 else 0.0
@@ -458,13 +458,13 @@ def _beside_tears(joined: NDArray[np.uint8]) -> Mask:
 
 
 def _unit(rho: F32, other: F32) -> np.float32:
-    """The inverse depth here that 1 of another pair is, from both of a frame (H, W); 1 for frames at infinity."""
+    """Median ratio of inverse depths (H, W) of one frame in the units of two pairs; 1 if all are at infinity."""
     both = (rho > 0.0) & (other > 0.0)
     return np.median(rho[both] / other[both]) if np.any(both) else np.float32(1.0)
 
 
 def _picked(shape: tuple[int, ...], size: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns, evenly apart, of an image (H, W), as many as ``size`` says."""
+    """Choose evenly spaced rows and columns of an image (H, W); ``size`` gives their numbers."""
     rows, columns = (np.arange(few) * many // few for many, few in zip(shape, size, strict=True))
     return rows, columns
 

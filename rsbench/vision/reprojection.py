@@ -1,9 +1,9 @@
-"""Compiled projection: cameras, and pixels of given inverse depth seen in another view, each line at its own pose.
+"""Compiled projection, and reprojection of pixels of given inverse depth to another view; each line has a pose.
 
-An ideal camera is the special case: its pixels look where they are, and its loops are compiled without a lens.
+For an ideal camera, pixels equal ideal pixels, and loops are compiled without a lens.
 
-The plane of constant depth through a pixel's point maps to the other view by the homography of two lines: that of
-the pixel and that which sees it there. Which line that is depends on where the pixel lands, so it is iterated.
+The plane of constant depth through a pixel's point maps to the other view by the homography of two lines: the
+line of the pixel, and the line that sees the point there. The latter depends on the result, so it is iterated.
 
 Saurer, Koeser, Bouguet, Pollefeys, "Rolling shutter stereo", ICCV 2013; derived again for a pose of every line.
 """
@@ -26,23 +26,23 @@ Table = FloatArray | None
 
 
 class Optics(NamedTuple):
-    """A camera and its scan for compiled loops, by ``optics_of``.
+    """A camera and its scan in the form that compiled loops take, made by ``optics_of``.
 
-    The lens of an ideal camera is None: the compiler then drops the branches that would use it. Rows and columns
-    share one compilation: a branch costs less than a second one.
+    The lens of an ideal camera is None, so that the compiler drops the branches that would use it. Rows and
+    columns share one compiled function: a branch costs less than compiling twice.
     """
 
     ideal: Table
-    """(H, W, 2) px at which the camera without its lens sees what a pixel sees; None where there is no lens."""
+    """(H, W, 2) ideal pixel of each pixel; None if there is no lens."""
     lens: Table
-    """(14,) fx, fy, cx, cy, reach, number of the model, k1, k2, p1, p2, k3, k4, k5, k6, or xi and alpha first of
-    these; None where there is no lens."""
+    """(14,) fx, fy, cx, cy, reach, number of the model, k1, k2, p1, p2, k3, k4, k5, k6 (double-sphere: xi and
+    alpha in place of k1 and k2, then 0); None if there is no lens."""
     columns: bool
-    """Whether lines, each read at one time, are columns."""
+    """Whether lines (pixels that are read at one time) are columns."""
 
 
 class LineMaps(NamedTuple):
-    """Maps of each line of a frame, from its ideal pixels to another camera's, with the optics of both.
+    """Map of each line of a frame from its ideal pixels to those of another camera, with the optics of both.
 
     Homogeneous target pixel = M_y (x, y, 1) + b_y / depth.
     """
@@ -52,15 +52,15 @@ class LineMaps(NamedTuple):
     b: FloatArray
     """(lines, 3) px m."""
     ideal: Table
-    """Field of ``Optics`` of the frame's camera, as ``columns``."""
+    """As in ``Optics``, for the frame's camera; also ``columns``."""
     lens: Table
-    """That of the target camera."""
+    """As in ``Optics``, for the target camera."""
     columns: bool
 
 
 @lru_cache(maxsize=8)
 def optics_of(camera: PinholeCamera, columns: bool = False) -> Optics:
-    """The camera for compiled loops."""
+    """Convert a camera to the form that compiled loops take."""
     lens = camera.lens
     if lens is None:
         return Optics(None, None, columns)
@@ -68,7 +68,7 @@ def optics_of(camera: PinholeCamera, columns: bool = False) -> Optics:
 
 
 def lens_table(camera: PinholeCamera, lens: Lens) -> FloatArray:
-    """(14,) the numbers of ``Optics.lens``."""
+    """Return the array (14,) described at ``Optics.lens``."""
     coefficients = (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6)
     if lens.model == "double-sphere":
         coefficients = (lens.xi, lens.alpha, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -78,14 +78,14 @@ def lens_table(camera: PinholeCamera, lens: Lens) -> FloatArray:
 
 @lru_cache(maxsize=4)
 def ideal_pixels_of(camera: PinholeCamera) -> FloatArray:
-    """(H, W, 2) ideal pixels of all pixels of a camera; not to be written to."""
+    """(H, W, 2) ideal pixels of all pixels of a camera. The result is cached: do not modify it."""
     return np.ascontiguousarray(camera.ideal_pixels(camera.pixel_grid()))
 
 
-# Not inlined by Numba, which would then keep the branch for None: LLVM inlines them.
+# Numba does not inline these functions, as it would then keep the branch for None; LLVM inlines them.
 @compiled(error_model="numpy")
 def look(ideal: Table, x: int, y: int) -> tuple[float, float]:
-    """Ideal pixel of a pixel of the image."""
+    """Return the ideal pixel of a pixel."""
     if ideal is None:
         return float(x), float(y)
     return ideal[y, x, 0], ideal[y, x, 1]
@@ -93,7 +93,7 @@ def look(ideal: Table, x: int, y: int) -> tuple[float, float]:
 
 @compiled(error_model="numpy")
 def look_between(ideal: Table, u: float, v: float) -> tuple[float, float]:
-    """Ideal pixel of any place of the image, linear between pixels; beyond the border as at the border."""
+    """Return the ideal pixel of a sub-pixel position by linear interpolation; extrapolated beyond the border."""
     if ideal is None:
         return u, v
     height, width = ideal.shape[:2]
@@ -107,7 +107,7 @@ def look_between(ideal: Table, u: float, v: float) -> tuple[float, float]:
 
 @compiled(error_model="numpy")
 def see(lens: Table, u: float, v: float) -> tuple[float, float]:
-    """Pixel at which the camera sees what it would see at an ideal pixel without its lens; NaN for none."""
+    """Return the pixel of an ideal pixel; NaN beyond the reach of the lens."""
     if lens is None:
         return u, v
     return distort(lens, u, v)
@@ -115,13 +115,13 @@ def see(lens: Table, u: float, v: float) -> tuple[float, float]:
 
 @compiled(error_model="numpy", inline="always")
 def line_of(columns: bool, x: int, y: int) -> int:
-    """Number of the line that reads a pixel of the image, in the order of the image."""
+    """Return the index of a pixel's line in the image."""
     return x if columns else y
 
 
 @compiled(error_model="numpy", inline="always")
 def across_lines(columns: bool, u: float, v: float) -> float:
-    """The coordinate of a place that numbers lines."""
+    """Return the coordinate of a position across the lines."""
     return u if columns else v
 
 
@@ -148,7 +148,7 @@ def bend(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
         r = np.sqrt(s)
         angle = np.arctan(r)
         a = angle * angle
-        # atan r = r - r^3 / 3: what is left out near the axis is below rounding.
+        # Near the axis atan r = r - r^3 / 3 up to rounding errors.
         bent = angle / r if r > 1e-6 else 1.0 - s / 3.0
         gain = bent * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
         return x * gain, y * gain
@@ -162,22 +162,22 @@ def bend(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
 
 F32 = NDArray[np.float32]
 _STEPS = 6
-"""Steps of the search for the line that sees a point: each scales the error by the motion, px, in one line."""
+"""Iterations for the line that sees a point; each multiplies the error by the motion per line, px."""
 
 
 class Reprojection(NamedTuple):
-    """Lines' maps of ideal pixels (x, y, 1) of inverse depth rho to another view's: A (G x + rho c) + rho B."""
+    """Maps ideal pixels x = (x, y, 1) of inverse depth rho to another view: A (G x + rho c) + rho B, per line."""
 
     G: FloatArray
     """(lines, 3, 3)."""
     c: FloatArray
     """(lines, 3)."""
     A: FloatArray
-    """(lines, 3, 3) of the other view's lines."""
+    """(lines, 3, 3), for the lines of the other view."""
     B: FloatArray
     """(lines, 3)."""
     ideal: Table
-    """Field of ``Optics``, as the next two."""
+    """As in ``Optics``, also the next two fields."""
     lens: Table
     columns: bool
     there: bool
@@ -187,13 +187,13 @@ class Reprojection(NamedTuple):
 def reprojection_of(
     camera: PinholeCamera, here: Pose, there: Pose, axes: tuple[int, int] = (1, 1)
 ) -> Reprojection:
-    """Maps from the view whose lines have the poses ``here`` to that of ``there``.
+    """Return the maps from a view with the line poses ``here`` to one with the line poses ``there``.
 
     Args:
-        camera: of both views.
-        here: ``cam_from_world`` (lines, 3, 3), (lines, 3).
-        there: the same of the other view.
-        axes: coordinate that numbers the lines of each: 1 for rows, 0 for columns.
+        camera: camera of both views.
+        here: ``cam_from_world`` (lines, 3, 3), (lines, 3) of the first view.
+        there: ``cam_from_world`` of the other view.
+        axes: for each view, 1 if its lines are rows, 0 if they are columns.
     """
     K, back = camera.ideal.K, np.swapaxes(here.R, -1, -2)
     centres = -(back @ here.t[..., None])[..., 0]
@@ -202,21 +202,21 @@ def reprojection_of(
 
 
 def parallax_gain(camera: PinholeCamera, maps: Reprojection, back: Reprojection) -> float:
-    """px, about, that a point of inverse depth 1 / m moves between two views; ``back`` is the reverse map."""
+    """Approximate parallax, px, of a point of inverse depth 1 / m between two views; ``back``: reverse map."""
     step = np.mean(back.c, axis=0) - np.mean(maps.c, axis=0)
     return max(camera.fx, camera.fy) * float(np.linalg.norm(step))
 
 
 @compiled(error_model="numpy", inline="always")
 def reproject(x: int, y: int, rho: float, line: int, maps: Reprojection) -> tuple[float, float, float]:
-    """Pixel and depth factor in the other view's camera of ``line``; NaN behind it."""
+    """Project a pixel to the other view's ``line``: pixel, and new over old inverse depth; NaN behind it."""
     p, q, r = _point(x, y, rho, maps)
     return _seen_from(p, q, r, rho, maps.A[line], maps.B[line], maps.lens)
 
 
 @compiled(error_model="numpy", inline="always")
 def _point(x: int, y: int, rho: float, maps: Reprojection) -> tuple[float, float, float]:
-    """World point of a pixel, times its inverse depth."""
+    """World point of a pixel, multiplied by its inverse depth."""
     G, c, own = maps.G, maps.c, line_of(maps.columns, x, y)
     gx, gy = look(maps.ideal, x, y)
     p = G[own, 0, 0] * gx + G[own, 0, 1] * gy + G[own, 0, 2] + rho * c[own, 0]
@@ -229,7 +229,7 @@ def _point(x: int, y: int, rho: float, maps: Reprojection) -> tuple[float, float
 def _seen_from(
     p: float, q: float, r: float, rho: float, A: FloatArray, B: FloatArray, lens: Table
 ) -> tuple[float, float, float]:
-    """Pixel and depth factor of such a point in a line's camera; NaN behind it."""
+    """Project a result of ``_point`` to a line's camera: as ``reproject`` returns it."""
     z = A[2, 0] * p + A[2, 1] * q + A[2, 2] * r + rho * B[2]
     s = 1.0 / z if z > 0.0 else np.nan
     u = (A[0, 0] * p + A[0, 1] * q + A[0, 2] * r + rho * B[0]) * s
@@ -240,7 +240,7 @@ def _seen_from(
 
 @compiled(error_model="numpy", inline="always")
 def sight_of(x: int, y: int, maps: Reprojection) -> tuple[Vector, Vector]:
-    """Ray of a pixel and centre of its camera, in the world's axes."""
+    """Ray of a pixel, and centre of the camera at the time of its line, in the world's axes."""
     G, c, own = maps.G, maps.c, line_of(maps.columns, x, y)
     gx, gy = look(maps.ideal, x, y)
     return apply(G[own], (gx, gy, 1.0)), (c[own, 0], c[own, 1], c[own, 2])
@@ -248,7 +248,7 @@ def sight_of(x: int, y: int, maps: Reprojection) -> tuple[Vector, Vector]:
 
 @compiled(error_model="numpy", inline="always")
 def homography(sight: tuple[Vector, Vector], line: int, maps: Reprojection) -> tuple[Vector, Vector]:
-    """M and b of a pixel and a line of the other view: it sees the pixel's point at M + rho b, homogeneous."""
+    """M and b for a pixel and a line of the other view, which sees the point at M + rho b (homogeneous)."""
     A, B = maps.A[line], maps.B[line]
     centre = apply(A, sight[1])
     return apply(A, sight[0]), (centre[0] + B[0], centre[1] + B[1], centre[2] + B[2])
@@ -256,7 +256,7 @@ def homography(sight: tuple[Vector, Vector], line: int, maps: Reprojection) -> t
 
 @compiled(error_model="numpy", inline="always")
 def land(M: Vector, b: Vector, rho: float, lens: Table) -> tuple[float, float, float]:
-    """Pixel and depth factor there of ``homography``; NaN behind the camera."""
+    """Project by M and b of ``homography``: as ``reproject`` returns it; NaN behind the camera."""
     z = M[2] + rho * b[2]
     s = 1.0 / z if z > 0.0 else np.nan
     u, v = see(lens, (M[0] + rho * b[0]) * s, (M[1] + rho * b[1]) * s)
@@ -267,11 +267,11 @@ def land(M: Vector, b: Vector, rho: float, lens: Table) -> tuple[float, float, f
 def reproject_all(
     rho: F32, lines: NDArray[np.int32], maps: Reprojection, beyond: float, places: F32, factors: F32
 ) -> None:
-    """Fill ``places`` (H, W, 2) px and depth factors (H, W) of all pixels of inverse depth ``rho`` (H, W).
+    """Fill ``places`` (H, W, 2), px, and ``factors`` (H, W) for all pixels, of inverse depth ``rho`` (H, W).
 
-    NaN where the other view does not see the point, not even if it were larger by ``beyond`` px on all sides; its
-    first and last line then see what lies before and after them. ``lines`` (H, W) are those where the search
-    begins and, after it, those where it ended.
+    They are as ``reproject`` returns them; NaN if a point is more than ``beyond`` px outside the other image,
+    beyond which the poses of its first and last line are used. ``lines`` (H, W) are the lines of the other view at
+    which the iterations start; they are replaced by the lines found.
     """
     height, width = rho.shape
     A, B, lens, there = maps.A, maps.B, maps.lens, maps.there
@@ -293,7 +293,7 @@ def reproject_all(
                 nearest = min(max(int(np.floor(along + 0.5)), 0), last)
             lines[y, x] = nearest
             if -1.0 < along < last + 1.0 and last > 0:
-                # Between two lines the place changes evenly with the line: there it is on the line that sees it.
+                # Between two lines the position is linear in the line: solve for the line that sees it.
                 beside = line + 1 if (along >= line and line < last) or line == 0 else line - 1
                 u2, v2, s2 = _seen_from(p, q, r, rho[y, x], A[beside], B[beside], lens)
                 step = beside - line
@@ -306,7 +306,7 @@ def reproject_all(
 
 
 def reproject_pixels(maps: Reprojection, rho: F32, lines: NDArray[Any], beyond: float = 0.0) -> tuple[F32, F32]:
-    """``reproject_all`` into new arrays."""
+    """Call ``reproject_all`` with new arrays and return these."""
     places, factors = np.zeros((*rho.shape, 2), np.float32), np.zeros_like(rho)
     reproject_all(rho, lines, maps, beyond, places, factors)
     return places, factors

@@ -393,8 +393,8 @@ def disparity_range(left: U8, right: U8, rig: StereoRig, options: SgmOptions) ->
 
 
 def _largest_disparity(left: U8, right: U8, options: SgmOptions, seen: Sequence[Mask] | None = None) -> float:
-    """With masks (H, W) of what the images show: of pixels that both show, also if infinitely far. Others find
-    false partners, of large disparity, as theirs are black."""
+    """Estimate the largest disparity at reduced size. With masks ``seen`` (H, W), only pixels are used that both
+    images show, also if infinitely far: others match black areas, at wrong, large disparities."""
     small = (max(left.shape[1] // _COARSE, 1), max(left.shape[0] // _COARSE, 1))
     a, b = (cv2.resize(image, small, interpolation=cv2.INTER_AREA) for image in (left, right))
     count = 16 * math.ceil(small[0] / 2 / 16)

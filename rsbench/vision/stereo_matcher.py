@@ -1,6 +1,6 @@
-"""The contracts of stereo matchers, and how they are found by name.
+"""The interfaces of stereo matchers, and loading by name.
 
-Those of a rectified pair give its disparity; those that need a motion give the depth of four images.
+A ``StereoMatcher`` returns the disparity of a rectified pair, a ``MotionMatcher`` the depth of four images.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from rsbench.vision.images import resample
 from rsbench.vision.reprojection import distort, ideal_pixels_of, lens_table
 
 _WIDEST = 2.0
-"""Times the size of the image: what a lens shows beyond has no depth from the other camera."""
+"""Largest size of the level image, in sizes of the ideal image: farther out, the other camera gives no depth."""
 _LARGEST, _SPARE, _CUT = 0.25, 0.12, 0.25
-"""Largest disparity of what both cameras must show, to be matched; what is added around it, as the cameras may
-read it at different times; most that is cut off at each side: shares of the ideal image's size."""
+"""Shares of the ideal image's size: largest disparity for which the level image shows all that both cameras see;
+margin around that, as the cameras may read it at different times; most that is cut off at each side."""
 _ONE_SURFACE_PX = 1.0
-"""Disparities of neighbours that differ by more are not interpolated."""
+"""Largest difference of neighbouring disparities between which is interpolated."""
 
 F32 = NDArray[np.float32]
 Cameras = Literal["ideal", "any", "rig"]
@@ -47,20 +47,20 @@ class StereoMatcher(ABC):
     def disparities(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Disparity ``x_left - x_right`` (H, W), px, on the left image's pixels and on the right image's.
+        """Return the disparity ``x_left - x_right`` (H, W), px, of the left and of the right image's pixels.
 
-        Images (H, W) or (H, W, 3) RGB; NaN is unknown, 0 and what noise puts below it infinitely far. Rows are
-        rectified in a rolling-shutter pair too, for both cameras read a row at the same time. ``rig`` gives focal
-        length and baseline to a matcher that limits its search.
+        Images are (H, W) or (H, W, 3) RGB. NaN is unknown; 0, and negative values due to noise, are infinitely
+        far. A rolling-shutter pair is rectified too, as both cameras read a row at the same time. ``rig`` gives
+        focal length and baseline to a matcher that limits its search.
         """
 
     def limited(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig, seen: Sequence[NDArray[np.bool_]]
     ) -> StereoMatcher:
-        """The matcher with a search that is limited to the disparities of this pair; by default itself.
+        """Return this matcher with its search limited to the disparities of this pair; by default unchanged.
 
         Args:
-            seen: (H, W) of each image, whether the camera shows the pixel; all others are black.
+            seen: for each image, a mask (H, W) of the pixels that its camera sees; others are black.
         """
         return self
 
@@ -70,17 +70,17 @@ class MotionMatcher(StereoMatcher):
 
     @property
     def cameras(self) -> Cameras:
-        """``ideal``: without a lens, rows read from the top by both at once; others are refused. ``any``."""
+        """Supported cameras, ``ideal`` (default), ``any`` or ``rig``, see ``CorrectorSpec``; no others."""
         return "ideal"
 
     @abstractmethod
     def depths(
         self, images: Mapping[View, NDArray[np.uint8]], rig: StereoRig, shutter: RollingShutter, motion: Motion
     ) -> Mapping[View, NDArray[Any]]:
-        """Depth (H, W), metres, of the pixels of each of the images, in the camera of the pixel's own line.
+        """Return the depth (H, W), metres, of each image, in the camera at the time of each line.
 
-        Images (H, W) or (H, W, 3) RGB by side and frame; NaN is unknown, inf infinitely far. ``motion`` is the
-        body's over one frame period, in metres.
+        Images are (H, W) or (H, W, 3) RGB, by side and frame. NaN is unknown, inf infinitely far. ``motion`` is
+        that of the body over one frame period, in metres.
         """
 
     def depths_of(
@@ -91,10 +91,10 @@ class MotionMatcher(StereoMatcher):
         motion: Motion,
         views: Sequence[View],
     ) -> dict[View, NDArray[Any]]:
-        """``depths`` of some of the images.
+        """Return the ``depths`` of some of the images.
 
-        Override it where that is cheaper. It is not called for matchers of other packages, which run in processes
-        of their own.
+        Override it if that is faster than computing all. It is not called for matchers of other packages, which
+        run in separate processes.
         """
         found = self.depths(images, rig, shutter, motion)
         return {view: found[view] for view in views}
@@ -103,7 +103,7 @@ class MotionMatcher(StereoMatcher):
     def disparities(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Nothing: one pair has no motion."""
+        """Raise NotImplementedError, as one pair does not suffice."""
         raise NotImplementedError("needs four images and a motion")
 
 
@@ -114,10 +114,10 @@ STEREO_MATCHERS: Kind[StereoMatcher, RunOptions] = Kind(
 
 
 def load_matcher(name_or_path: str | Path) -> MatcherEntry:
-    """A stereo matcher by the name of a card or entry point, or by the path of a card.
+    """Load a stereo matcher by the name of a card or entry point, or by the path of a card.
 
     Raises:
-        RsbenchError: no such matcher, two of that name, or its card or class is wrong.
+        RsbenchError: the matcher does not exist, two have this name, or its card or class is wrong.
     """
     return plugins.load_entry(STEREO_MATCHERS, name_or_path)
 
@@ -125,10 +125,10 @@ def load_matcher(name_or_path: str | Path) -> MatcherEntry:
 def find_disparities(
     entry: MatcherEntry, left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig
 ) -> tuple[F32, F32]:
-    """What a matcher makes of a pair, checked: float32 (H, W) each, finite or NaN.
+    """Match a pair and check the result: two arrays (H, W), float32, finite or NaN.
 
     Raises:
-        RsbenchError: another package's matcher raised, or answered something else: one line with its name.
+        RsbenchError: the rig is not ideal, the matcher needs a motion or failed, or the result is wrong.
     """
     where = f"{STEREO_MATCHERS.singular} {entry.name!r}"
     check_ideal(rig, where)
@@ -145,12 +145,12 @@ def find_disparities(
 
 
 def needs_motion(entry: MatcherEntry) -> bool:
-    """Whether depth is found with a motion: ``find_depths`` asks such a matcher, ``find_disparities`` others."""
+    """Whether the matcher needs a motion: use ``find_depths`` if so, else ``find_disparities``."""
     return isinstance(entry.component, MotionMatcher)
 
 
 def refuse_motion(entry: MatcherEntry, why: str) -> None:
-    """Raises RsbenchError for a matcher that needs a motion where none is known; ``why`` says why not."""
+    """Raise RsbenchError if the matcher needs a motion; ``why`` is the reason why none is known."""
     if needs_motion(entry):
         raise RsbenchError(
             f"{STEREO_MATCHERS.singular} {entry.name!r}: needs the rig's motion, and {why}; "
@@ -166,12 +166,12 @@ def find_depths(
     motion: Motion,
     views: Sequence[View] | None = None,
 ) -> dict[View, F32]:
-    """What a matcher that needs a motion makes of four images, checked: float32 (H, W) metres, inf or NaN.
+    """Find depth by a matcher that needs a motion, and check it: (H, W) float32, metres, positive, inf or NaN.
 
-    ``views``: the images whose depth is wanted; all when None.
+    ``views`` selects the images whose depth is returned; None: all.
 
     Raises:
-        RsbenchError: it takes no such cameras, or another package's matcher raised or answered something else.
+        RsbenchError: the cameras are not supported, another package's matcher failed, or the result is wrong.
     """
     where, matcher = f"{STEREO_MATCHERS.singular} {entry.name!r}", entry.component
     assert isinstance(matcher, MotionMatcher)
@@ -217,10 +217,10 @@ def _checked(disparity: object, size: tuple[int, ...], where: str) -> F32:
 def sensor_disparities(
     entry: MatcherEntry, left: NDArray[np.uint8], right: NDArray[np.uint8], rig: StereoRig
 ) -> tuple[F32, F32]:
-    """``find_disparities`` on the pixels (H, W) of cameras with or without a lens, in ideal px.
+    """Call ``find_disparities`` for any cameras; disparities (H, W) are in ideal px, on the images' own pixels.
 
-    The matcher sees a pair without distortion that is as wide as the images reach. Its disparities are carried
-    back to the pixels of the images; those whose other end lies outside the other image are dropped.
+    The matcher gets a pair without distortion, of the size of ``widened``. Its disparities are interpolated at the
+    pixels of the images; a disparity whose other end lies outside the other image is dropped.
 
     Raises:
         RsbenchError: see ``find_disparities``.
@@ -240,10 +240,10 @@ def sensor_disparities(
 
 
 def widened(rig: StereoRig) -> PinholeCamera:
-    """The rig's ideal camera with an image that holds what both cameras show at any disparity up to ``_LARGEST``.
+    """Return the rig's ideal camera with an image large enough for all that both cameras see up to ``_LARGEST``.
 
-    Cameras that converge show what is as near as the point where their axes meet with larger disparities. If the
-    cameras are equal, the image holds all that they show.
+    This limit of the disparity is increased for cameras that converge, by the disparity at the point where their
+    axes meet. If the cameras are equal and aligned, the image contains all that they see.
     """
     return rig.camera if rig.rectified else _widened(rig)
 
@@ -275,11 +275,11 @@ def _widened(rig: StereoRig) -> PinholeCamera:
 
 @lru_cache(maxsize=2 * len(SIDES))
 def pixel_rays(rig: StereoRig, side: Side) -> FloatArray:
-    """(H, W, 3) rays of all pixels of a camera, in the body's axes; not to be written to."""
+    """(H, W, 3) rays of all pixels of a camera, in the body's axes; the array is read-only."""
     camera = rig.sensor(side)
     if camera.lens is None:
         rays = rig.eye(side).unproject(camera.pixel_grid())
-    else:  # the inverse of the lens is kept
+    else:  # its ideal pixels are cached
         rays = camera.ideal.unproject(ideal_pixels_of(camera)) @ rig.own(side).R
         rays = rays / np.where(rays[..., 2:] > 0.0, rays[..., 2:], np.nan)
     rays.setflags(write=False)
@@ -288,27 +288,27 @@ def pixel_rays(rig: StereoRig, side: Side) -> FloatArray:
 
 @lru_cache(maxsize=2 * len(SIDES))
 def level_pixels(rig: StereoRig, side: Side) -> FloatArray:
-    """(H, W, 2) pixels of the level image, which ``widened`` would see, that all pixels of a camera are at."""
+    """(H, W, 2) positions of all pixels of a camera in the level image, which is that of ``widened``."""
     shift = np.array([widened(rig).cx - rig.camera.cx, widened(rig).cy - rig.camera.cy])
     return rig.camera.ideal.project(pixel_rays(rig, side)) + shift
 
 
 @lru_cache(maxsize=2 * len(SIDES))
 def level_places(rig: StereoRig, side: Side) -> F32:
-    """(h, w, 2) pixels of a camera at which all pixels of the level image are; NaN beside it."""
+    """(h, w, 2) positions of all pixels of the level image in a camera's image; NaN outside."""
     wide = widened(rig)
     return _places(wide.unproject(wide.pixel_grid()), rig, side)
 
 
 def camera_of_body(rig: StereoRig, side: Side) -> tuple[FloatArray, FloatArray]:
-    """(3, 3) from rays in the body's axes to homogeneous pixels of a camera without its lens, and (14,) the
-    numbers of its lens, or of one without distortion."""
+    """Matrix (3, 3) from rays in the body's axes to homogeneous ideal pixels of a camera, and ``lens_table`` (14,)
+    of its lens, or of a lens without distortion."""
     camera = rig.sensor(side)
     return camera.ideal.K @ rig.own(side).R, lens_table(camera, camera.lens or Lens(model="brown-conrady"))
 
 
 def _places(rays: FloatArray, rig: StereoRig, side: Side) -> F32:
-    """(h, w, 2) pixels of a camera that see rays (h, w, 3) in the body's axes; NaN beside the image."""
+    """Project rays (h, w, 3) in the body's axes to pixels (h, w, 2) of a camera; NaN outside its image."""
     places, camera = np.full((*rays.shape[:2], 2), np.nan, np.float32), rig.sensor(side)
     _fill_places(rays, *camera_of_body(rig, side), camera.width, camera.height, places)
     return places
@@ -316,7 +316,7 @@ def _places(rays: FloatArray, rig: StereoRig, side: Side) -> F32:
 
 @compiled(error_model="numpy", inline="always")
 def seen_at(m: FloatArray, lens: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
-    """Pixel of a point in the body's axes in a camera, by ``camera_of_body``; NaN if it is not visible."""
+    """Project a point in the body's axes to a pixel, by the results of ``camera_of_body``; NaN if not visible."""
     depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
     s = 1.0 / depth if depth > 0.0 else np.nan
     u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z) * s
@@ -337,18 +337,18 @@ def _fill_places(
 
 @lru_cache(maxsize=4)
 def own_depths(rig: StereoRig, side: Side) -> F32:
-    """(H, W) ``StereoRig.own_depth`` of all pixels of a camera."""
+    """``StereoRig.own_depth`` (H, W) for all pixels of a camera."""
     return np.asarray(pixel_rays(rig, side) @ rig.own(side).R[2]).astype(np.float32)
 
 
 def body_depth(depth: F32, rig: StereoRig, side: Side) -> F32:
-    """Depth (H, W) along the body's z of depth along the camera's own axis."""
+    """Convert depth (H, W) along the camera's own axis to depth along the body's z axis."""
     return depth if rig.aligned else depth / own_depths(rig, side)
 
 
 def _around(ideal: PinholeCamera, low: FloatArray, high: FloatArray, cut: float) -> PinholeCamera:
-    """The ideal camera with an image that holds pixels from ``low`` (2,) to ``high``, by whole pixels, at most
-    ``_WIDEST``; at most the share ``cut`` is cut off at each side."""
+    """Extend or crop the ideal camera's image by whole pixels to those from ``low`` (2,) to ``high``. It becomes
+    at most ``_WIDEST`` times as large, and at most the share ``cut`` is removed at each side."""
     size = np.array([ideal.width, ideal.height])
     least, spare = -np.floor(cut * size), np.floor((_WIDEST - 1.0) * 0.5 * size)
     low = np.clip(np.ceil(-low), least, spare).astype(int)
@@ -358,7 +358,7 @@ def _around(ideal: PinholeCamera, low: FloatArray, high: FloatArray, cut: float)
 
 
 def between_pixels(disparity: F32, places: FloatArray) -> F32:
-    """Disparity (H, W), px, at places (..., 2): between its pixels on one surface, else that of the nearest."""
+    """Sample a disparity (H, W), px, at positions (..., 2): bilinear on one surface, else the nearest pixel."""
     out = np.full((1, places.size // 2), np.nan, np.float32)
     _fill_between(disparity, places.reshape(1, -1, 2), out)
     return out.reshape(places.shape[:-1])
@@ -385,7 +385,7 @@ def _fill_between(disparity: F32, places: FloatArray, out: F32) -> None:
 
 
 def _with_partner(disparity: F32, rig: StereoRig, side: Side) -> F32:
-    """The disparities (H, W) of a camera's pixels whose other end the other camera shows."""
+    """Set disparities (H, W) to NaN if their corresponding pixel is outside the other camera's image."""
     sign, other = (1.0, SIDES[1]) if side == "left" else (-1.0, SIDES[0])
     rays = pixel_rays(rig, side).copy()
     rays[..., 0] -= sign / rig.camera.fx * disparity

@@ -90,13 +90,13 @@ class Scores(NamedTuple):
 
 
 def isolated(plan: Plan, isolation: Isolation) -> Plan:
-    """The plan with other packages' components in child processes."""
+    """Return the plan with components of other packages run in child processes."""
     metrics = (isolation.wrap(METRICS, metric, _serve_metric, (), _Isolated) for metric in plan.metrics)
     return replace(plan, chain=isolation.chain(plan.chain), metrics=tuple(metrics))
 
 
 def repeats_of(plan: Plan) -> list[Job]:
-    """The motions that are planned in addition to the first one of each solver; long ones are started early."""
+    """Return the motions planned in addition to the first one of each solver; slow ones are started early."""
     return [
         Job(sequence, solver.name, seed)
         for solver in sorted(plan.solvers, key=lambda entry: entry.name, reverse=True)
@@ -107,7 +107,7 @@ def repeats_of(plan: Plan) -> list[Job]:
 
 
 def _shared_words(value: Any) -> Any:
-    """JSON-ready data in which equal texts are one object, so that the rows of many sequences fit in memory."""
+    """Share equal strings in JSON-ready data, so that the rows of many sequences fit in memory."""
     if isinstance(value, dict):
         return {_shared_words(k): _shared_words(v) for k, v in value.items()}
     if isinstance(value, list):
@@ -118,7 +118,7 @@ def _shared_words(value: Any) -> Any:
 def _serve(
     dataset: Path, out: Path, options: EvaluationOptions
 ) -> Callable[[Job], tuple[dict[str, Any] | None, list[str]]]:
-    """Function that runs jobs in a child process; returns the fields of ``Scores``, and new hashes."""
+    """Return the function that runs jobs in a child process: it returns fields of ``Scores`` and new hashes."""
     use_one_thread()
     evaluation = open_evaluation(dataset, out, options)
     sequences = {each.name: each for each in evaluation.sequences}
@@ -185,7 +185,7 @@ class Evaluation:
         return [name for scores in found for name in scores.stale]
 
     def _here(self, hashes: FileHashes, step: Step) -> dict[str, Scores]:
-        """Scores by the name of the sequence, all by this process except the repeats."""
+        """Return scores by sequence name; this process does all the work except repeated motions."""
         scored = {}
         with SolverRunner() as runner, Isolation() as isolation:
             plan = isolated(self.plan, isolation)
@@ -200,7 +200,7 @@ class Evaluation:
         return scored
 
     def _apart(self, hashes: FileHashes, step: Step, workers: Workers) -> dict[str, Scores]:
-        """Scores by the name of the sequence, by ``workers``."""
+        """Return scores by sequence name, computed by ``workers``."""
         due = self.plan.sequence_names
         if repeats_of(self.plan):  # repeats need the matches, and are scored with the others
             self._done([Job(name, predict=True) for name in sorted(due)], hashes, step, workers)
@@ -227,10 +227,10 @@ class Evaluation:
             self._done(todo, hashes, step, workers)
 
     def _done(self, jobs: list[Job], hashes: FileHashes, step: Step, workers: Workers) -> dict[str, Scores]:
-        """Do jobs in child processes of one thread; returns the scores of those that score.
+        """Run jobs in single-threaded child processes; return the scores of the jobs that compute scores.
 
         Raises:
-            RsbenchError: a dataset, a stored prediction or an entry is at fault.
+            RsbenchError: a dataset, a stored prediction or an entry is invalid.
             LostJobsError: see ``finished_jobs``.
         """
         scored = {}
@@ -248,7 +248,7 @@ class Evaluation:
         return scored
 
     def scored(self, places: Places, plan: Plan) -> Scores:
-        """Scores of the stored current predictions of a sequence."""
+        """Compute the scores of the stored current predictions of a sequence."""
         scorer = Scorer(places, plan, kept_scores(self.out, places.sequence.name), self.options.rehash)
         scorer.score()
         return Scores(scorer.rows, scorer.stale)

@@ -41,7 +41,7 @@ _SEEDS = "seeds"
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationOptions:
-    """Options of an evaluation beside the dataset; components are given by name or by the path of a card."""
+    """Options of an evaluation, except the dataset; components are given by name or by the path of a card."""
 
     solvers: tuple[str, ...]
     correction_solver: str = "rs-stereo-refined"
@@ -141,7 +141,7 @@ def _check_metres(chain: CorrectionOptions, solvers: tuple[SolverEntry, ...]) ->
 def _chosen(
     only: tuple[str, ...], sequences: Mapping[str, str], solvers: list[str]
 ) -> tuple[frozenset[str], frozenset[str]]:
-    """Names of the selected sequences and solvers; a sequence of many frames selects all its pairs."""
+    """Return the selected sequences and solvers; the name of a sequence with many frames selects all its pairs."""
     known = [*dict.fromkeys([*sequences.values(), *sequences]), *solvers]
     for name in only:
         if name not in known:
@@ -153,7 +153,7 @@ def _chosen(
 
 
 def reference_of(kind: Kind[Any, Any], entry: Entry[Any, Any]) -> str:
-    """The name or path by which an entry is loaded again."""
+    """Return the name or path by which an entry is loaded again."""
     if entry.path is None or kind.cards is None or list_cards(kind.cards).get(entry.name) == entry.path:
         return entry.name
     return os.fspath(entry.path.resolve())
@@ -201,13 +201,13 @@ class Recipe:
 
 
 def hash_of_data(sequence: Sequence, folders: tuple[str, ...], hash_of: HashOf) -> str:
-    """Identity of sequence.json and of a sequence's frames in some folders; ``hash_of`` hashes a file."""
+    """Return a hash of sequence.json and of the frames in given folders; ``hash_of`` hashes a file."""
     paths = [sequence.folder / "sequence.json", *sequence.frame_files(folders)]
     return hashlib.sha256("".join(map(hash_of, paths)).encode()).hexdigest()
 
 
 class Places:
-    """Paths of the predictions on a sequence, with the identity that each must have to be current.
+    """Paths of the predictions for a sequence, and the identity that each must have to be current.
 
     Methods take the component in question; all other options come from ``chain``. ``hash_of`` returns the SHA-256
     of a file of the sequence.
@@ -315,14 +315,14 @@ def _recipe(chain: CorrectionOptions, record: Mapping[str, Any]) -> Recipe:
 
 
 def _named(load: Callable[[str], Component], source: str) -> Component:
-    """The component that a record names. Cards run code and records are untrusted, so paths are refused."""
+    """Load the component named in a record. Paths are refused: records are untrusted, and cards run code."""
     if not isinstance(source, str) or is_path(source):
         raise RsbenchError(f"{source!r}: a card that this command does not name")
     return load(source)
 
 
 def _again(load: Callable[[Any], Component], source: Any) -> Component | None:
-    """The component that made a record, in its present version; None if it no longer exists."""
+    """Return the present version of the component that made a record; None if it no longer exists."""
     try:
         return load(source)
     except (RsbenchError, KeyError, TypeError):

@@ -59,7 +59,7 @@ Step = Callable[[str], None]
 
 
 def prediction_steps(plan: Plan) -> int:
-    """How often ``Bench.predict`` reports progress on a sequence."""
+    """Return the number of progress reports of ``Bench.predict`` for a sequence."""
     solvers = len(plan.solver_names)
     return 1 + solvers + (1 + len(Recipe(chain=plan.chain).variants()) if plan.corrects else 0)
 
@@ -88,7 +88,7 @@ class Bench:
                 self.move(entry)
                 step(f"{self.sequence.name}: {entry.name}")
         if self.plan.corrects:
-            # If the cameras read rows at different times, a pair has no disparity of one time.
+            # If the cameras read rows at different times, disparity depends on the motion.
             if self.sequence.shutter.rows_together or needs_motion(self.plan.chain.matcher):
                 self._find_depth()
             step(f"{self.sequence.name}: depth")
@@ -97,7 +97,7 @@ class Bench:
                 step(f"{self.sequence.name}: correction")
 
     def stands(self, artefact: Artefact) -> bool:
-        """Whether an artefact is current and need not be made again."""
+        """Return whether an artefact is current and need not be computed again."""
         return not self.plan.force and artefact.record() is not None
 
     # Matches
@@ -123,7 +123,7 @@ class Bench:
 
     @cached_property
     def _matches(self) -> Correspondences | str:
-        """The matches, or the reason why there are none."""
+        """Return the matches, or the reason why there are none."""
         artefact = self.places.matches()
         record = artefact.record() or {"success": False, "reason": "not made"}
         return load_matches(artefact.file(".npz")) if record["success"] else str(record["reason"])
@@ -154,7 +154,7 @@ class Bench:
         artefact.finish(record, robust.seconds if seed == 0 else None)
 
     def _refuse_another(self, entry: SolverEntry, artefact: Artefact) -> None:
-        """Raises RsbenchError instead of overwriting the prediction of another solver of the same name."""
+        """Raise RsbenchError if the prediction of another solver with the same name would be overwritten."""
         stored = read_record(artefact.file(".json")) or {}
         other, own = stored.get("entry", ""), reference_of(SOLVERS, entry)
         if not self.plan.force and other not in ("", own) and stored.get("key") != entry.key:
@@ -189,7 +189,7 @@ class Bench:
         artefact.finish(record, seconds)
 
     def _disparities(self, entry: MatcherEntry) -> dict[str, NDArray[np.float32]]:
-        """Disparities by the name of the view; a matcher that needs a motion gets the estimated one."""
+        """Return disparities by the name of the view; a matcher that needs a motion gets the estimated one."""
         images, sequence = self.images, self.sequence
         found: dict[View, NDArray[np.float32]] = {}
         if needs_motion(entry):
@@ -231,7 +231,7 @@ class Bench:
         artefact.finish(record, seconds)
 
     def _given(self, recipe: Recipe) -> Given | str:
-        """The known inputs of a recipe, or the reason why one of them is missing."""
+        """Return the given inputs of a recipe, or the reason why one of them is missing."""
         motion: Motion | str | None = None
         pairs: Pairs | str | None = None
         if recipe.names["solver"] != NONE:
@@ -252,7 +252,7 @@ class Bench:
         return Given(matches=matches, motion=motion, pairs=pairs, gyro=gyro)
 
     def _pairs(self, recipe: Recipe) -> Pairs | str | None:
-        """The frame pairs with the matcher's depth; None if the correction computes depth with its own motion."""
+        """Return the pairs with the matcher's depth; None if the correction computes depth with its own motion."""
         moved = needs_motion(recipe.chain.matcher)
         if recipe.true_motion if moved else not self.sequence.shutter.rows_together:
             return None
@@ -296,7 +296,7 @@ def _motion_record(entry: SolverEntry, robust: RobustEstimate) -> dict[str, Any]
 
 
 def read_motion(places: Places, solver: SolverEntry) -> Motion | str:
-    """The body's motion in metres that a solver predicted, or the reason why there is none."""
+    """Read the predicted motion of the body, in metres, or return the reason why there is none."""
     record = places.motion(solver).record()
     if record is None:
         return "not made"
@@ -307,7 +307,7 @@ def read_motion(places: Places, solver: SolverEntry) -> Motion | str:
 
 
 def load_disparities(path: Path, rig: StereoRig) -> dict[str, NDArray[np.float32]]:
-    """Disparity of every view (H, W), by names such as ``left_0``.
+    """Read the disparities (H, W) of all views, by names such as ``left_0``.
 
     Raises:
         RsbenchError: the file is damaged, or is of another camera.
@@ -324,7 +324,7 @@ def load_disparities(path: Path, rig: StereoRig) -> dict[str, NDArray[np.float32
 
 
 def true_pairs(sequence: Sequence, images: Images) -> Pairs:
-    """Rolling-shutter frames with their true depth, which is infinite where there is no surface."""
+    """Return rolling-shutter frames with their true depth, which is infinite where there is no surface."""
     truth = {view: sequence.depth("rs", *view) for view in VIEWS}
     return known_depth(images, {view: np.where(z > 0, z, np.float32(np.inf)) for view, z in truth.items()})
 
@@ -332,7 +332,7 @@ def true_pairs(sequence: Sequence, images: Images) -> Pairs:
 def depth_of(
     disparity: NDArray[np.float32], sequence: Sequence, side: Side, frame: int, *, timed: bool = False
 ) -> NDArray[np.float32]:
-    """Depth (H, W), metres, 0 where the disparity is not known: the depth convention of the dataset.
+    """Convert disparity to depth (H, W), metres, 0 where unknown, in the depth convention of the dataset.
 
     ``timed``: whether the disparities already account for the motion. If not, and the camera has a lens, the two
     ends of a disparity are read at different times; the true motion then gives both poses, because the matcher is

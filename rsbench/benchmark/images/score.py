@@ -1,4 +1,4 @@
-"""Scores of stored predictions against the truth; no solver runs here.
+"""Compute scores of stored predictions against the ground truth; no solver runs here.
 
 Scores of depth and of corrected frames are stored and reused; those of motions take no time.
 """
@@ -46,8 +46,8 @@ def kept_scores(out: Path, sequence: str) -> Path:
 
 @cache
 def scoring_version() -> dict[str, str]:
-    """Everything that determines a score apart from its inputs: our whole source, and the packages that it
-    uses."""
+    """Return everything that determines a score apart from its inputs: the source of rsbench and the versions of
+    its packages."""
     package = Path(str(resources.files("rsbench")))
     return {
         **numeric_version(),
@@ -57,7 +57,7 @@ def scoring_version() -> dict[str, str]:
 
 
 def hash_of_prediction(files: Iterable[Path]) -> str:
-    """Hash of the bytes of a prediction's files; a missing one counts too."""
+    """Return a hash of the content of a prediction's files; a missing file changes it."""
     found = [f"{path.name} {sha256(path) if path.is_file() else 'is not there'}" for path in files]
     return hashlib.sha256("\n".join(found).encode()).hexdigest()
 
@@ -74,7 +74,7 @@ KEYS = {
 AFTER = {"pose": ("inliers", "matches", "iterations", "reason")}
 """Columns after those of the metrics."""
 _SEES = "single-view"
-"""Corrector from which the pixels that a frame saw are determined."""
+"""Corrector that determines the pixels of a corrected frame that are visible in the rolling-shutter frame."""
 
 
 class Scorer:
@@ -83,9 +83,9 @@ class Scorer:
     def __init__(self, places: Places, plan: Plan, kept: Path | None = None, rehash: bool = False) -> None:
         """
         Args:
-            places: of the predictions.
-            plan: of the evaluation.
-            kept: folder of scores that are reused and stored, see ``kept_scores``; None: nothing is stored.
+            places: paths and identities of the predictions.
+            plan: the evaluation.
+            kept: folder in which scores are stored and reused, see ``kept_scores``; None: nothing is stored.
             rehash: whether stored scores are computed again.
         """
         self.places, self.plan, self.sequence = places, plan, places.sequence
@@ -141,7 +141,7 @@ class Scorer:
             self.rows["failures"].append(row)
 
     def _metrics(self, case: Case | None, kind: type[Case]) -> dict[str, float]:
-        """Columns of all metrics that read such cases; NaN where another package's metric failed."""
+        """Return the columns of all metrics for this type of case; NaN if another package's metric failed."""
         row: dict[str, float] = {}
         for metric in self.plan.metrics:
             if metric.component.case is kind:

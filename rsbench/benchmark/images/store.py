@@ -1,7 +1,7 @@
-"""Stored results, each with the identity of what it was made from: it is reused while that identity is current.
+"""Stored results, each with a hash (identity) of its inputs; a result is reused while this identity is unchanged.
 
 A prediction is an artefact: a record, ``NAME.json``, and the files beside it whose names begin with ``NAME``. The
-record is deleted before the files change and written after all of them, so an artefact that has a record is
+record is deleted before the files change and written after all of them, so an artefact with a record is
 complete. Results that consist of JSON alone, such as scores, are stored by ``keep`` and read by ``kept``.
 """
 
@@ -86,7 +86,7 @@ _KINDS: dict[str, type[_Record]] = {
 
 
 def is_whole(name: str, record: Mapping[str, Any]) -> bool:
-    """Whether a record has exactly the content that one of an artefact such as ``motion/gs-8pt`` must have."""
+    """Return whether a record has exactly the fields that its kind of artefact requires."""
     try:
         parse_card(_KINDS[name.partition("/")[0]], record, name)
     except RsbenchError:
@@ -95,17 +95,17 @@ def is_whole(name: str, record: Mapping[str, Any]) -> bool:
 
 
 SECONDS = "seconds.json"
-"""Run times of a sequence's artefacts; they differ between runs, so no other file contains any."""
+"""File of the run times of a sequence's artefacts; they differ between runs, so no other file has run times."""
 
 
 def identity_of(**parts: object) -> str:
-    """Hash of everything that determines an artefact; the values must be JSON-ready."""
+    """Return a hash of everything that determines an artefact; the values must be JSON-ready."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Artefact:
-    """A prediction on disk, or the place of a future one."""
+    """A stored prediction, or the path of one that is not yet computed."""
 
     folder: Path
     """Folder of the sequence."""
@@ -115,45 +115,45 @@ class Artefact:
 
     @property
     def stem(self) -> Path:
-        """Path of its files without their suffixes."""
+        """Common path of the files, without suffixes."""
         return self.folder / self.name
 
     def file(self, end: str) -> Path:
-        """Path of one of its files, by its ending such as ``-inliers.npz``."""
+        """Return the path of a file with an ending such as ``-inliers.npz``."""
         return self.stem.with_name(self.stem.name + end)
 
     def record(self) -> dict[str, Any] | None:
-        """The stored record if it is current, otherwise None."""
+        """Return the stored record if it is current, otherwise None."""
         record = read_record(self.file(".json"))
         current = record is not None and record.get("identity") == self.identity and is_whole(self.name, record)
         return record if current else None
 
     def forget(self) -> None:
-        """Mark it as outdated, so that the next run makes it again."""
+        """Mark the artefact as outdated, so that the next run computes it again."""
         self.file(".json").unlink(missing_ok=True)
 
     def start(self) -> None:
-        """Call before its files are written."""
+        """Prepare the artefact; must be called before its files are written."""
         self.stem.parent.mkdir(parents=True, exist_ok=True)
         self.forget()
 
     def finish(self, record: Mapping[str, Any], seconds: float | None = None) -> None:
-        """Call when its files are complete: writes the record, JSON-ready, and the seconds."""
+        """Write the record, JSON-ready, and the run time; must be called when the files are complete."""
         if seconds is not None:
             write_json(self.folder / SECONDS, read_seconds(self.folder) | {self.name: round(seconds, 4)})
         write_json(self.file(".json"), {"identity": self.identity, **record})
 
 
 def keep(path: Path, identity: str, content: object) -> None:
-    """Store ``content``, JSON-ready but for NaN and infinity, for ``kept``."""
+    """Store ``content``, which is JSON-ready except for NaN and infinity; ``kept`` reads it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     record = {"identity": identity, "sha256": _digest(content), "content": content}
     write_bytes(path, (json.dumps(record) + "\n").encode())
 
 
 def kept(path: Path, identity: str) -> Any:
-    """The content that ``keep`` stored with this identity; None if there is no file, another identity, or
-    damage."""
+    """Read the content that ``keep`` stored with this identity; None if the file is missing, damaged or has
+    another identity."""
     record = read_record(path) or {}
     content = record.get("content")
     current = record.get("identity") == identity and record.get("sha256") == _digest(content)
@@ -166,7 +166,7 @@ def resumed(
     make: Callable[[list[str]], Generator[tuple[str, Any], None, None]],
     step: Callable[[str], object],
 ) -> dict[str, Any]:
-    """Results by name: those that ``kept`` finds, and the others as ``make`` yields them, which are stored.
+    """Return results by name: stored ones are read with ``kept``, the others are computed by ``make`` and stored.
 
     Args:
         names: of all results.
@@ -193,7 +193,7 @@ def _digest(content: object) -> str:
 
 
 def read_record(path: Path) -> dict[str, Any] | None:
-    """A stored record of any identity; None if none can be read."""
+    """Read a stored record of any identity; None if it cannot be read."""
     try:
         return read_json(path)
     except RsbenchError:
@@ -201,7 +201,7 @@ def read_record(path: Path) -> dict[str, Any] | None:
 
 
 def records_below(folder: Path, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Names and whole records of all artefacts of a kind, such as ``motion``, in the order of their names."""
+    """Yield names and complete records of all artefacts of a kind, such as ``motion``, sorted by name."""
     for path in listed(folder / kind, ".json"):
         record = read_record(path)
         if record is not None and is_whole(kind, record):
@@ -209,6 +209,6 @@ def records_below(folder: Path, kind: str) -> Iterator[tuple[str, dict[str, Any]
 
 
 def read_seconds(folder: Path) -> dict[str, float]:
-    """Seconds by the name of the artefact; values that are not numbers are left out."""
+    """Read the run times, s, by the name of the artefact; values that are not numbers are omitted."""
     found = read_record(folder / SECONDS) or {}
     return {name: float(value) for name, value in found.items() if isinstance(value, int | float)}

@@ -286,7 +286,7 @@ def _frame(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame, 
 
 
 def _flips(image: NDArray[np.uint8], truth: NDArray[np.uint8], masks: dict[str, Any]) -> Numbers:
-    """Mean FLIP per mask; NaN where the package flip-evaluator is not installed."""
+    """Return the mean FLIP error per mask; NaN if the package flip-evaluator is not installed."""
     errors, names = flip(image, truth), ("flip_common", "flip_covered", "flip_all")
     if errors is None:
         return dict.fromkeys(names, math.nan)
@@ -393,8 +393,8 @@ class SensorTrack(PlacedTrack):
 
 
 def seen_alike(truths: Sequence[TrueFrame], frames: Sequence[Frame]) -> float:
-    """Mean over frames of the SSIM to the truth, both blurred, over the common pixels; at least 0. Pixels that
-    were not drawn count 0.
+    """Return the mean over frames of the SSIM of blurred images over the common pixels; at least 0. Pixels that
+    are not drawn count as 0.
 
     The blur removes most of the sensor's noise, so that smoothing does not raise the score; contrast, colour,
     strong noise and filled holes still affect it.
@@ -414,8 +414,8 @@ def _alike(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame) 
 
 
 def placed(truths: Sequence[TrueFrame], frames: Sequence[Frame]) -> float:
-    """Mean over frames of the share of textured common pixels that are drawn, each weighted by the displacement of
-    its window: 1 at 0, 0 from ``LIMIT_PX`` on. It is 1 if no window has enough texture."""
+    """Return the mean over frames of the share of textured common pixels that are drawn, weighted by the
+    displacement of their window: 1 at 0 px, 0 from ``LIMIT_PX`` on. It is 1 if no window has enough texture."""
     return float(np.mean([_placed(*frame, true) for true, frame in zip(truths, frames, strict=True)]))
 
 
@@ -438,7 +438,7 @@ def _placed(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame)
 
 
 def _distance(around: NDArray[np.float32], window: NDArray[np.float32]) -> float:
-    """Distance, px, of the best position of a window from the centre of the search; infinite at its border."""
+    """Return the displacement, px, of the best match of a window in its search region; infinite at the border."""
     found = cv2.matchTemplate(around, window, cv2.TM_CCOEFF_NORMED)
     y, x = np.unravel_index(int(np.argmax(found)), found.shape)
     if not (0 < y < 2 * _REACH_PX and 0 < x < 2 * _REACH_PX):
@@ -449,7 +449,7 @@ def _distance(around: NDArray[np.float32], window: NDArray[np.float32]) -> float
 
 
 def _top(three: NDArray[np.float32]) -> float:
-    """Position of the maximum of the parabola through three neighbouring values, relative to the middle one."""
+    """Return the maximum position, relative to the middle, of the parabola through three neighbouring values."""
     before, middle, after = map(float, three)
     bend = before - 2.0 * middle + after
     return 0.5 * (before - after) / bend if bend < 0.0 else 0.0

@@ -1,21 +1,21 @@
 """Calibration of stated covariances: coverage of their ellipsoids, and a log score.
 
-**Coverage.** The squared error by the stated covariance (NEES) is chi-squared where the covariance is right, with
+**Coverage.** The squared error normalised by the stated covariance (NEES) is chi-squared if this is correct, with
 six degrees of freedom for a motion and one for a readout ratio (Bar-Shalom, Li, Kirubarajan, Estimation with
-Applications to Tracking and Navigation, 2001, section 5.4): the ellipsoid of a level then holds the truth in that
-share of problems. A single large error can dominate a mean, so the interval is that of the median.
+Applications to Tracking and Navigation, 2001, section 5.4): the ellipsoid of a level then contains the truth in
+that share of problems. A single large error can dominate the mean, so the interval is that of the median.
 
-**Log score.** Coverage alone is reached by large deviations too; a proper score also rewards small ones. It is the
-logarithm of the density that an answer states at the true motion x = (w, d), over that of a vague guess v:
+**Log score.** Good coverage is also possible with large deviations; a proper score rewards small ones too. It is
+the logarithm of the ratio of the density stated by an answer, at the true motion x = (w, d), to a vague density v:
 
     log score = ln((1 - e) N(x; answer, covariance) + e v(x)) - ln v(x),    e = 0.01.
 
-v knows of a split only how large its motions are: a Cauchy density in three dimensions about 0 for w, and one for
-d, whose scales are the median lengths of the true w and d. So units cancel, and the score counts nats (1.44 bits)
-of information beyond v. A failure, or an answer without a covariance, states v and has 0. The share e makes
-the score robust: a truth that the Gaussian excludes costs ln e = -4.6, however far away it is. It is proper within
-0.01: stating another density than the believed one gains at most -ln(1 - e) on average. (By
-Gibbs' inequality no mixture beats the true density p, and (1 - e) p + e v is at least (1 - e) p.) See Gneiting and
+v depends only on the size of the motions in a split: it is a product of three-dimensional Cauchy densities about 0
+for w and d, whose scales are the median lengths of the true w and d. So units cancel, and the score is the
+information in nats (1.44 bits) relative to v. A failure, or an answer without a covariance, counts as v and scores
+0. The share e makes the score robust: it is at least ln e = -4.6, even if the Gaussian excludes the truth. It is
+proper within 0.01: stating another density than the believed one gains at most -ln(1 - e) on average. (By Gibbs'
+inequality no mixture beats the true density p, and (1 - e) p + e v is at least (1 - e) p.) See Gneiting and
 Raftery, Strictly proper scoring rules, JASA 2007, section 4.1.
 """
 
@@ -45,9 +45,9 @@ Triple = tuple[float, float, float]
 
 
 def stated(error: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """NEES and the logarithm of the Gaussian density of an error (n,) under a stated covariance (n, n).
+    """Return NEES and the logarithm of the Gaussian density of an error (n,) under a stated covariance (n, n).
 
-    inf and -inf if the covariance is not positive definite.
+    They are inf and -inf if the covariance is not positive definite.
     """
     values, vectors = np.linalg.eigh(covariance)
     if not values[0] > 0.0:
@@ -57,7 +57,7 @@ def stated(error: FloatArray, covariance: FloatArray) -> tuple[float, float]:
 
 
 def vague_log_densities(motions: Sequence[Motion]) -> FloatArray:
-    """ln v (n,) of the true motions of a split, in radians and metres to the power of -3 each."""
+    """Return ln v (n,) of the true motions of a split; v has the unit rad^-3 m^-3."""
     found = np.zeros(len(motions))
     for vectors in (np.array([motion.w for motion in motions]), np.array([motion.d for motion in motions])):
         lengths = np.linalg.norm(vectors, axis=1)
@@ -67,7 +67,7 @@ def vague_log_densities(motions: Sequence[Motion]) -> FloatArray:
 
 
 def log_score(log_density: float, vague: float) -> float:
-    """The log score from the logarithms of both densities at the truth; 0 if no density is stated (NaN)."""
+    """Return the log score from the logarithms of both densities at the truth; 0 if none is stated (NaN)."""
     if math.isnan(log_density):
         return 0.0
     return float(np.logaddexp(math.log1p(-VAGUE) + log_density - vague, math.log(VAGUE)))
@@ -83,7 +83,7 @@ class Calibration:
     stated: int
     """Number of answers with a covariance."""
     spread: Triple
-    """Median of NEES divided by that of a right covariance: 1 if it is right, 4 if errors are twice as large."""
+    """Median NEES divided by its expected median: 1 if the covariance is right, 4 if errors are doubled."""
     covers: tuple[Triple, ...]
     """For each of ``LEVELS``, the share of problems whose true value lies within the ellipsoid of that level."""
     mean: float
@@ -93,7 +93,7 @@ class Calibration:
 
 
 def calibration(scores: pd.DataFrame, unknowns: int) -> Calibration | None:
-    """Calibration of an entry's scores, whose answers have ``unknowns`` numbers; None without covariances."""
+    """Compute the calibration from the scores of an entry with ``unknowns`` unknowns; None without covariances."""
     if "nees" not in scores:
         return None
     known = scores[scores["nees"].notna()]
@@ -116,12 +116,12 @@ def calibration(scores: pd.DataFrame, unknowns: int) -> Calibration | None:
 
 
 def _chi_squared(level: float, unknowns: int) -> float:
-    """Quantile ``level`` of the chi-squared distribution with ``unknowns`` degrees of freedom."""
+    """Return the quantile ``level`` of the chi-squared distribution with ``unknowns`` degrees of freedom."""
     return 2.0 * float(gammaincinv(0.5 * unknowns, level))
 
 
 def named_numbers(found: Calibration | None, scored: bool) -> dict[str, Triple]:
-    """The triples by the names of their columns; NaN if no covariance was stated.
+    """Return the triples by the names of their columns; NaN if no covariance was stated.
 
     ``scored``: whether the log score is included.
     """

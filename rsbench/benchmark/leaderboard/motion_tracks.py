@@ -320,7 +320,7 @@ class MotionTrack(SolverTrack):
 
 
 def _mistaken(answers: Sequence[Answer], split: Split) -> tuple[str, int] | None:
-    """The mistake that explains most of the motions, and their number; None if no mistake does."""
+    """Return the mistake that explains most of the motions, and their number; None if there is none."""
     found: Counter[str] = Counter()
     for answer in answers:
         truth = split.by_name[answer.name]
@@ -396,10 +396,10 @@ def _row_angle(w: FloatArray, truth: Truth) -> float:
 
 @lru_cache(maxsize=8)
 def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str, FloatArray]:
-    """``Track.medians_at_bound`` for Gaussian errors in the first problems; a bound takes as long as a solver.
+    """Compute ``Track.medians_at_bound`` for Gaussian errors in the first ``count`` problems, as bounds are slow.
 
-    A method that uses fewer inputs is compared with the bound for these; the readout ratio counts as known. The
-    direction is that of the body, or, if only the left camera is used, that of this camera.
+    A method is compared with the bound for the inputs that it uses; the readout ratio counts as given. The
+    direction is that of the body's translation, or of the left camera's if only this camera is used.
     """
     bounds = list[Bound]()
     views: Views = "four-view" if seen == "links" else "pairs"
@@ -419,10 +419,10 @@ def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str
 
 
 def smooth(motion: Motion) -> Motion:
-    """Smooth motion for a bound: of a spline with vibrations, the twist around which it vibrates; the bound
-    differs by less than 5 %.
+    """Return a smooth motion for a bound: a spline with vibrations is replaced by the twist around which it
+    vibrates, which changes the bound by less than 5 %.
 
-    The derivative of a spline by its end takes a hundred times as long, and a path through given poses has none.
+    The derivatives of a spline by its end pose are 100 times slower, and a path through given poses has none.
     """
     return TwistMotion(motion.w, motion.d) if isinstance(motion, SplineMotion | TrajectoryMotion) else motion
 
@@ -435,7 +435,7 @@ def _median(axes: FloatArray, draws: FloatArray) -> float:
 
 
 def bound_text(split: Split, folder: Path) -> str:
-    """A submission of motions with errors as small as the data allow.
+    """Return a submission of motions with the smallest errors that the data allow.
 
     The errors are drawn from the Cramer-Rao bound of the matches without the outliers: the best possible result of
     an unbiased method that knows the outliers and uses all links.
@@ -467,13 +467,13 @@ def _at_the_bound(split: Split) -> Iterator[dict[str, Any]]:
 
 
 def nearness(over: FloatArray) -> FloatArray:
-    """Score of errors (...) over their medians at the bound: 1 up to 1, 0 from 100 on, linear in the logarithm."""
+    """Return scores of ratios (...) of errors to medians at the bound: 1 up to 1, 0 from 100 on, log-linear."""
     with np.errstate(divide="ignore"):
         return np.clip(1.0 - np.log10(over) / _DECADES, 0.0, 1.0)
 
 
 def _add_bound_columns(rows: list[Row], submission: Submission, split: Split) -> None:
-    """points-2: errors over their medians at the Cramer-Rao bound."""
+    """Add columns of points-2: errors divided by their medians at the Cramer-Rao bound."""
     numbers = [int(truth.name[1:]) for truth in split.truths]
     bounds = bound_medians(split.draws, split.seed, max(numbers) + 1, "links")
     at_R, at_T = (bounds[key][numbers] for key in ("e_R_deg", "e_T_deg"))
@@ -486,7 +486,7 @@ def _add_bound_columns(rows: list[Row], submission: Submission, split: Split) ->
 
 
 def add_area_columns(rows: list[Row], submission: Submission, split: Split) -> None:
-    """pose-2: areas under the curves of rotation and direction, separately."""
+    """Add columns of pose-2: separate areas under the curves of rotation and direction."""
     for row, truth in zip(rows, split.truths, strict=True):
         R = max(0.0, 1.0 - row["e_R_deg"] / _AREAS_DEG[0])
         T = R if math.isnan(row["e_T_deg"]) else max(0.0, 1.0 - row["e_T_deg"] / _AREAS_DEG[1])
@@ -494,7 +494,7 @@ def add_area_columns(rows: list[Row], submission: Submission, split: Split) -> N
 
 
 def _add_match_columns(rows: list[Row], submission: Submission, split: Split) -> None:
-    """pose-own: number of own matches, and share of right ones."""
+    """Add columns of pose-own: number of the method's own matches, and share of correct ones."""
     own = read_own_matches(submission.folder, split.by_name)
     for row, truth in zip(rows, split.truths, strict=True):
         row |= match_scores(truth.rendered, None if own is None else own[truth.name])
@@ -561,7 +561,7 @@ def match_files(beside: Path) -> list[str]:
 
 
 def read_own_matches(beside: Path, problems: Mapping[str, Truth]) -> dict[str, Correspondences] | None:
-    """Own matches, by the name of the problem; None if there is no folder of matches.
+    """Read a method's own matches, by the name of the problem; None if there is no folder of matches.
 
     Raises:
         RsbenchError: see ``match_files``; a file is no such table, names an unknown problem, or has more matches
@@ -600,9 +600,9 @@ def _table(path: Path, problems: Mapping[str, Truth]) -> pd.DataFrame:
 
 
 def match_scores(sequence: Rendered, matches: Correspondences | None) -> dict[str, float]:
-    """Number of matches of one problem, each counted once, and the share of right ones.
+    """Return the number of distinct matches of a problem and the share of correct ones.
 
-    NaN if the method submits no matches at all; a problem without matches has no right ones.
+    NaN if the method submits no matches at all; a problem without matches has the share 0.
     """
     if matches is None:
         return {"matches": math.nan, "matches_1px": math.nan}
@@ -616,7 +616,7 @@ def match_scores(sequence: Rendered, matches: Correspondences | None) -> dict[st
 
 
 def match_errors(sequence: Rendered, views: tuple[View, View], rows: FloatArray) -> FloatArray:
-    """Distances (n,), px, of the second ends of matches (n, 4) from their true places; infinite if there is none.
+    """Return distances (n,), px, of the second points of matches (n, 4) from the true ones; infinite without one.
 
     A pixel that shows no surface is at infinity.
     """
@@ -660,7 +660,7 @@ _SEVERAL_MODELS: dict[str, Any] = {"parting": "motion", "choosing": True, "round
 
 
 def pose_fields(inputs: Frames) -> dict[str, Any]:
-    """Fields of a track of motions from given matches of frames under several laws of motion."""
+    """Return the fields of a track of motions from given matches of frames under several motion models."""
     scores = (
         Score("auc_apart", "AUC apart", "mean of AUC of e_R to 0.1 deg and of e_T to 1 deg", "share", "higher"),
         *(

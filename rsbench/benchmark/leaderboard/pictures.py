@@ -272,12 +272,12 @@ BoolArray = NDArray[np.bool_]
 
 
 class Parting(NamedTuple):
-    """A division of the pixels into parts by a quantity of each pixel."""
+    """A division of the pixels into parts by a value of each pixel."""
 
     name: str
     title: str
     starts: tuple[float, ...]
-    """Smallest value of each part, which is its label in figures."""
+    """Lower limit of each part, which is its label in figures."""
 
 
 PARTINGS = (
@@ -295,12 +295,12 @@ PARTINGS = (
 
 
 def columns(score: str, parting: Parting) -> list[str]:
-    """Columns of scores.csv, such as ``bad_1_rows_1``, in the order of the parts."""
+    """Return the columns of scores.csv, such as ``bad_1_rows_1``, in the order of the parts."""
     return [f"{score}_{parting.name}_{number}" for number in range(1, len(parting.starts) + 1)]
 
 
 def texture(image: NDArray[np.uint8]) -> FloatArray:
-    """(H, W) standard deviation of the mean of the colours in a window around each pixel, 8-bit levels."""
+    """Return the standard deviation (H, W) of the grey level in a window around each pixel, 8-bit levels."""
     grey = _mean(image.astype(np.float64))
     mean, square = (
         cv2.blur(each, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT_101) for each in (grey, grey * grey)
@@ -313,7 +313,7 @@ Parts = dict[str, BoolArray]
 
 
 def parts_within(score: str, image: NDArray[np.uint8], row: int, counted: BoolArray) -> Parts:
-    """The ``counted`` pixels of a picture (H, W, 3) of row ``row``'s time, by the columns of a ``score``."""
+    """Divide the ``counted`` pixels of a picture (H, W, 3) with reference row ``row``; masks by score column."""
     height, width = image.shape[:2]
     away = np.broadcast_to(np.abs(np.arange(height) - row)[:, None] / height, (height, width))
     found = Parts()
@@ -326,10 +326,10 @@ def parts_within(score: str, image: NDArray[np.uint8], row: int, counted: BoolAr
 def rms_by_part(
     score: str, frames: Iterable[tuple[NDArray[np.uint8] | None, NDArray[np.uint8], Parts]]
 ) -> dict[str, float]:
-    """Root mean squared errors of frames, by the columns of a ``score``; NaN for a part without pixels.
+    """Return root mean squared errors of frames, by the columns of a ``score``; NaN for a part without pixels.
 
-    ``frames``: for each the image (H, W, 3), None for a failure, which errs by all levels; its truth; and its
-    ``parts_within``.
+    ``frames``: for each frame its image (H, W, 3), or None for a failure, whose error is 255 everywhere; the true
+    image; and its ``parts_within``.
     """
     sums = {name: np.zeros(2) for parting in PARTINGS for name in columns(score, parting)}
     for image, truth, parts in frames:
@@ -341,10 +341,10 @@ def rms_by_part(
 
 
 def shares(parts: Parts, wrong: BoolArray) -> dict[str, float]:
-    """Share of ``wrong`` (H, W) pixels in each part, by column; NaN for a part without pixels."""
+    """Return the share of ``wrong`` (H, W) pixels in each part, by column; NaN for a part without pixels."""
     return {name: float(np.mean(wrong[part])) if np.any(part) else math.nan for name, part in parts.items()}
 
 
 def _mean(image: FloatArray) -> FloatArray:
-    """Mean (H, W) over the colours of an image (H, W, 3); np.mean is much slower over an axis of three."""
+    """Return the mean (H, W) over the colours of an image (H, W, 3); np.mean is much slower for three values."""
     return (image[..., 0] + image[..., 1] + image[..., 2]) / 3.0

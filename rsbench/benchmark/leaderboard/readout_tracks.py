@@ -98,8 +98,7 @@ class ReadoutTrack(SolverTrack):
         super().check_entry(entry)
 
     def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-        """The readout ratio that explains the matches best; the solver is one of rsbench's, so no ``runner`` is
-        needed."""
+        """Return the readout ratio that fits the matches best; the solver is built in and needs no ``runner``."""
         solver = entry.solver
         assert isinstance(solver, RefinedSolver)
         matches, start = join_stereo(problem.correspondences).correspondences, time.perf_counter()
@@ -127,7 +126,7 @@ class ReadoutTrack(SolverTrack):
 
 
 def _add_skill_columns(rows: list[Row], submission: Submission, split: Split) -> None:
-    """readout-3: a refusal is never worse than a guess."""
+    """Add columns of readout-3, in which a failure has the score 0 and a wrong answer may score less."""
     spread = spread_of([truth.shutter.readout_ratio for truth in split.truths])
     for row, truth in zip(rows, split.truths, strict=True):
         answer = submission.answers.get(truth.name)
@@ -143,10 +142,10 @@ def _add_skill_columns(rows: list[Row], submission: Submission, split: Split) ->
 
 
 def crps(error: float, sigma: float) -> float:
-    """Continuous ranked probability score of a Gaussian; ``abs(error)`` where ``sigma`` is 0 or far smaller.
+    """Return the continuous ranked probability score of a Gaussian; ``abs(error)`` if ``sigma`` is negligible.
 
-    It is the integrated squared distance of the Gaussian's distribution function from the step at the truth, by
-    the closed form of Gneiting and Raftery (JASA 2007, section 4.2).
+    It is the integral of the squared difference between the Gaussian's distribution function and a step at the
+    truth, in the closed form of Gneiting and Raftery (JASA 2007, section 4.2).
     """
     z = error / sigma if sigma > 0.0 else math.inf
     if math.isinf(z):
@@ -156,24 +155,24 @@ def crps(error: float, sigma: float) -> float:
 
 
 def spread_of(ratios: Sequence[float]) -> float:
-    """Mean CRPS of the distribution of all ``ratios`` over these ratios: half of their mean distance.
+    """Return the mean CRPS if the empirical distribution of all ``ratios`` is stated for each of them.
 
-    No single distribution that is stated for all of them has a lower mean. If all ratios are equal, the value is
-    that of ratios uniform in 0 to 1.
+    It is half of their mean distance, and no other single distribution has a lower mean. If all ratios are equal,
+    the value for ratios uniform in [0, 1] is returned.
     """
     known = np.array(ratios)
     return 0.5 * float(np.mean(np.abs(known[:, None] - known))) or 1.0 / 6.0
 
 
 def best_constant(ratios: Sequence[float]) -> float:
-    """The constant guess with the largest AUC@0.1: a sum of tents has its maximum at the top of one of them."""
+    """Return the constant with the largest AUC@0.1; a sum of triangle functions has its maximum at a vertex."""
     known = np.array(ratios)
     tents = np.clip(1.0 - np.abs(known[:, None] - known) / AUC_READOUT["auc_r10"], 0.0, None)
     return float(known[np.argmax(np.sum(tents, axis=1))])
 
 
 def _constant(split: Split, folder: Path) -> str:
-    """The best constant as a submission."""
+    """Return a submission that answers the best constant for all problems."""
     best = best_constant([truth.shutter.readout_ratio for truth in split.truths])
     words = "The one ratio that, said of all sequences, has the best score"  # as on published boards
     header = {**template_header(split, CONSTANT), "uses": [ORACLE], "description": words}

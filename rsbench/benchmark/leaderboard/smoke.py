@@ -1,4 +1,4 @@
-"""A few entries of every track on a few problems, compared with stored scores: what a change moved."""
+"""Smoke run: score a few entries of every track on a few problems and compare them with stored scores."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ from rsbench.solvers.engine.base import BESIDE, SOLVERS, load_solver_entry
 from rsbench.storage.files import read_table, write_json, write_table
 
 CARD = "leaderboard-smoke"
-"""Card of the dataset for the tracks of frames."""
+"""Dataset card for the tracks of rendered frames."""
 ENTRIES = {track.name: track.smoke for track in TRACKS.values() if track.inputs.rendered and track.smoke}
-"""Entries by track of frames."""
+"""Entries of each track of rendered frames."""
 PROBLEMS = 6
-"""Number of problems of points: a minute for all of rsbench's solvers."""
+"""Default number of problems of the track ``points``: all of rsbench's solvers take a minute."""
 _NAMES = ("method", "problem", "success")
 _SAME, _NOTHING = 1e-4, 1e-7
-"""Relative and absolute difference of equal scores. The same code on the same machine gives the same digits; a
-processor that sums in another order changes the last ones, and now and then a choice of RANSAC: with OpenBLAS and
-Numba set to use no AVX, 113 of 114 answers agreed so far, and one differed."""
+"""Relative and absolute tolerance of scores. The same code on the same machine gives identical scores. A processor
+that sums in another order changes the last digits, and occasionally the sample that RANSAC selects: without AVX in
+OpenBLAS and Numba, 113 of 114 answers agreed within the tolerance."""
 OTHER_FRAMES = 0.15
-"""Relative difference of equal scores where the frames are others: twice the largest that was seen. Rendered
-with AVX2 in place of AVX-512, up to 0.09 % of the values of these frames were others, by up to 26 codes, and no
-depth: 56 of 57 answers kept their scores to 7.3 %. One, of the corrector zhuang, was better by 4 dB, by another
-choice of RANSAC."""
+"""Relative tolerance if the frames differ from those of the stored scores: twice the largest observed difference.
+With AVX2 instead of AVX-512, up to 0.09 % of the pixel values of a rendered frame changed, by up to 26 levels, and
+no depth changed: 56 of 57 scores agreed within 7.3 %. The other one, of the corrector zhuang, improved by 4 dB
+because RANSAC selected another sample."""
 Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
 
 
@@ -62,26 +62,26 @@ class Job(NamedTuple):
 
 
 def file_of(track: str) -> str:
-    """Where the scores of a track are stored."""
+    """Return the name of the file with the scores of a track."""
     return "scores.csv" if track == "points" else f"{track}.csv"
 
 
 def record_of(track: str) -> str:
-    """Where their provenance is stored."""
+    """Return the name of the file with the provenance of these scores."""
     return "provenance.json" if track == "points" else f"{track}.json"
 
 
 def own_solvers() -> list[str]:
-    """Names of the solvers that come with rsbench and need no more than ``points`` gives, each once."""
+    """Return the names of rsbench's own solvers that need only the inputs of the track ``points``."""
     own = [offer.name for offer in offers(SOLVERS) if offer.origin == "rsbench"]
     return [name for name in own if not BESIDE.keys() & load_solver_entry(name).solver.spec.minimum]
 
 
 def chosen_jobs(tracks: Sequence[str] | None, entries: Sequence[str] | None) -> list[Job]:
-    """Jobs, those that take longest first; of points a job for each solver.
+    """Return the jobs, the longest first; the track ``points`` has one job per solver.
 
     Raises:
-        RsbenchError: no such track, or an entry that none of the tracks has.
+        RsbenchError: a track does not exist, or none of the tracks has an entry.
     """
     chosen = [track_of_name(track).name for track in dict.fromkeys(tracks or TRACKS)]
     jobs, taken = list[Job](), set[str]()
@@ -91,7 +91,7 @@ def chosen_jobs(tracks: Sequence[str] | None, entries: Sequence[str] | None) -> 
         known = own_solvers() if track == "points" else list(ENTRIES[track])
         if track == "points" and entries is not None:
             others = {name for names in ENTRIES.values() for name in names} - set(known)
-            known = [name for name in entries if name not in others]  # cards of anybody
+            known = [name for name in entries if name not in others]  # also user cards
         names = tuple(name for name in known if entries is None or name in entries)
         taken |= set(names)
         jobs += [Job(track, (name,)) for name in names] if track == "points" else [Job(track, names)][: len(names)]
@@ -109,9 +109,9 @@ def chosen_jobs(tracks: Sequence[str] | None, entries: Sequence[str] | None) -> 
 def smoke_frames(
     data: Path | None, tracks: Collection[str], problems: int | None, bar: Bar, note: Callable[[str], None]
 ) -> Iterator[Path | None]:
-    """The dataset of the tracks of frames, if any: ``data``, or rendered into a folder that is removed afterwards.
+    """Yield the dataset folder for tracks of frames: ``data``, or a rendered one that is removed afterwards.
 
-    ``bar`` makes a progress bar of a title and a number of steps; ``note`` prints a line.
+    ``bar`` makes a progress bar from a title and a number of steps; ``note`` prints a line.
     """
     if data is not None or set(tracks) <= {"points"}:
         yield data
@@ -133,20 +133,20 @@ def run_smoke(
     workers: int = 1,
     step: Callable[[str], None] = lambda word: None,
 ) -> dict[str, pd.DataFrame]:
-    """Scores of entries on the first problems of their tracks; no stored prediction is used.
+    """Score entries on the first problems of their tracks, without stored predictions.
 
     Args:
-        jobs: what to run.
+        jobs: the jobs to run.
         data: dataset of the tracks of frames.
-        problems: how many; by default ``PROBLEMS`` of points, and all sequences of the dataset.
-        workers: processes of one thread; with 1 it is this one.
+        problems: number of problems; default: ``PROBLEMS`` for points, and all sequences of the dataset.
+        workers: number of single-threaded processes; with 1, jobs run in this process.
         step: called after each job.
 
     Returns:
-        By track, a row for each entry and problem: method, problem, success, and ``smoke_metrics`` of the track.
+        For each track, a table with a row per entry and problem: method, problem, success, and ``smoke_metrics``.
 
     Raises:
-        RsbenchError: no such entry, or no such number of problems.
+        RsbenchError: an entry does not exist, or the number of problems is invalid.
     """
     rows: dict[str, list[Row]] = {job.track: [] for job in jobs}
     if workers == 1:
@@ -176,10 +176,10 @@ def _rows_of(job: Job, data: Path | None, problems: int | None) -> list[Row]:
 
 
 def track_scores(track: str, data: Path | None, entries: Sequence[str], problems: int | None) -> pd.DataFrame:
-    """Scores of entries on the first problems of a track, made as for a board: inputs, answers, scores.
+    """Score entries on the first problems of a track by the steps of a board: inputs, answers, scores.
 
     Raises:
-        RsbenchError: no such dataset or entry, or no such number of problems.
+        RsbenchError: the dataset or an entry does not exist, or the number of problems is invalid.
     """
     split, tables = TRACKS[track].split(data), list[pd.DataFrame]()
     if data is None:
@@ -197,7 +197,7 @@ def track_scores(track: str, data: Path | None, entries: Sequence[str], problems
 
 
 def _answers(split: Split, entries: Sequence[str], inputs: Path, work: Path) -> Iterator[tuple[str, Path]]:
-    """Entries with their files of answers; cards run in this process."""
+    """Yield the entries and their files of answers; cards run in this process."""
     oracles = {ORACLE, *(name for name, _ in split.track.oracles)}
     cards = [name for name in entries if name not in oracles]
     if cards:
@@ -208,7 +208,7 @@ def _answers(split: Split, entries: Sequence[str], inputs: Path, work: Path) -> 
 
 
 def hashes_of_frames(data: Path) -> dict[str, str]:
-    """A hash of the images and depth maps of each sequence of a dataset."""
+    """Return a hash of the images and depth maps of each sequence of a dataset."""
     manifest, found = read_dataset_manifest(data), dict[str, str]()
     for name in manifest.sequences:
         pictures = [
@@ -224,10 +224,10 @@ def hashes_of_frames(data: Path) -> dict[str, str]:
 
 
 def read_scores(folder: Path, track: str = "points") -> pd.DataFrame:
-    """What ``run_smoke`` returned for a track when it was stored.
+    """Read the stored table of ``run_smoke`` for a track.
 
     Raises:
-        RsbenchError: it is missing or damaged.
+        RsbenchError: the file is missing or damaged.
     """
     path = folder / file_of(track)
     if not path.is_file():
@@ -241,7 +241,7 @@ def read_scores(folder: Path, track: str = "points") -> pd.DataFrame:
 def store_scores(
     folder: Path, found: Mapping[str, pd.DataFrame], frames: dict[str, str], command: str
 ) -> list[Path]:
-    """Write what ``run_smoke`` returned, with the ``command`` that made it; returns the files of scores."""
+    """Write the tables of ``run_smoke`` and their provenance with the ``command``; return the files of scores."""
     folder.mkdir(parents=True, exist_ok=True)
     for track, table in found.items():
         inputs = {} if track == "points" else {"frames": frames}
@@ -251,7 +251,7 @@ def store_scores(
 
 
 def other_frames(folder: Path, track: str, frames: dict[str, str]) -> list[str]:
-    """Problems whose frames are not those of the stored scores; ``frames`` is of ``hashes_of_frames``."""
+    """Return the problems whose frames differ from those of the stored scores, by ``hashes_of_frames``."""
     inputs = (read_record(folder / record_of(track)) or {}).get("inputs")
     stored = inputs.get("frames") if isinstance(inputs, dict) else None
     return [name for name, digest in frames.items() if not isinstance(stored, dict) or stored.get(name) != digest]
@@ -260,10 +260,10 @@ def other_frames(folder: Path, track: str, frames: dict[str, str]) -> list[str]:
 def differences(
     track: str, found: pd.DataFrame, stored: pd.DataFrame, others: Collection[str] = ()
 ) -> Iterator[str]:
-    """A line for each score of ``found`` that is not the stored one: track, problem, entry, metric, both values.
+    """Yield a line for each score of ``found`` that differs from the stored one beyond the tolerance.
 
     Args:
-        others: problems whose frames are not those of the stored scores, see ``OTHER_FRAMES``.
+        others: problems whose frames differ from those of the stored scores, see ``OTHER_FRAMES``.
     """
     known = {(row["method"], row["problem"]): row for row in stored.to_dict("records")}
     for row in found.to_dict("records"):

@@ -1,4 +1,4 @@
-"""The problems of a split with their truth: drawn from a seed, or the sequences of a rendered dataset."""
+"""Problems of a split with their ground truth, drawn from a seed or read from a rendered dataset."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ from rsbench.vision.feature_matcher import load_features
 
 Range = tuple[float, float]
 _SHORTEST_SECRET = 16
-"""Characters of a seed file: shorter ones could be guessed by trying all."""
+"""Minimum number of characters of a seed file; shorter ones could be found by trying all texts."""
 FEATURES = "sift"
-"""Matcher of the protocols with given matches."""
+"""Feature matcher of the protocols with given matches."""
 _GYRO = "imu"
 """The channel with the samples of a gyroscope."""
 _AROUND = 1.0
-"""Frame periods before the first frame and after the last one of which samples are given."""
+"""Frame periods before the first and after the last frame from which gyroscope samples are given."""
 FEWEST_FRAMES, MOST_FRAMES = 4, 250
 """Fewest and most frames of a whole sequence."""
 
@@ -51,30 +51,30 @@ FEWEST_FRAMES, MOST_FRAMES = 4, 250
 
 
 def _no_kinds(seed: int, number: int) -> dict[str, float | str]:
-    """A function by name: processes are handed it."""
+    """Return no properties; a named function can be passed to other processes, a lambda cannot."""
     return {}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Draws:
-    """The problems of a protocol, by a seed and their numbers."""
+    """Generator of the problems of a protocol, from a seed and the number of a problem."""
 
     scope: tuple[str, ...]
-    """Names that seed its random generators, so that no two protocols share a draw."""
+    """Names from which random generators are seeded, so that protocols have independent draws."""
     problems: int
     setting: Callable[[int, int], Setting]
-    """Setting of a problem by seed and number."""
+    """Function that returns the setting of a problem, from the seed and the number."""
     outlier_images: OutlierImages
     kinds: Callable[[int, int], dict[str, float | str]] = _no_kinds
-    """Further properties, beside sizes, against which scores are plotted, by seed and number."""
+    """Function that returns properties, in addition to sizes, against which scores are plotted."""
     moved: Callable[[int, int], Motion] | None = None
-    """Motion of a problem by seed and number, where it is not one of the setting's motion model."""
+    """Function that returns the motion of a problem; None: the motion model of the setting is used."""
 
     def rng(self, seed: int, what: str, number: int) -> np.random.Generator:
         return generator(seed, *self.scope, what, number)
 
     def motion(self, seed: int, number: int) -> Motion:
-        """The motion of a problem."""
+        """Return the motion of a problem."""
         return _motion(self, seed, number)
 
 
@@ -90,7 +90,7 @@ def log_uniform(rng: np.random.Generator, sizes: Range) -> float:
 
 
 def points_setting(seed: int, number: int) -> Setting:
-    """points-1: all sizes are drawn at random from fixed ranges; the camera is the paper's."""
+    """Return a setting of points-1: all sizes are drawn from fixed ranges; the camera is the paper's."""
     rng = generator(seed, "leaderboard", "setting", number)
     return Setting(
         width=900,
@@ -104,7 +104,7 @@ def points_setting(seed: int, number: int) -> Setting:
 
 
 def circumstances(rng: np.random.Generator, baseline: Range, readout: Range) -> dict[str, Any]:
-    """What the settings of all protocols draw last, and in this order."""
+    """Draw the values that all protocols share; they are drawn last, in this order."""
     return {
         "baseline": log_uniform(rng, baseline),
         "noise_px": log_uniform(rng, (0.05, 1.0)),
@@ -120,7 +120,7 @@ POINTS_1 = Draws(scope=("leaderboard",), problems=250, setting=points_setting, o
 
 @dataclass(frozen=True)
 class RigKind:
-    """Sizes of a kind of rig of points-2; docs/reference/protocols.md has the sources."""
+    """Ranges of a type of rig in points-2; docs/reference/protocols.md has the sources."""
 
     width: int
     height: int
@@ -128,13 +128,13 @@ class RigKind:
     baseline: Range
     depth: Range
     rotation_deg: Range
-    """Rotation in a frame period."""
+    """Rotation per frame period, degrees."""
     translation: Range
-    """Metres in a frame period."""
+    """Translation per frame period, metres."""
     shake: str
-    """Preset of its spline motion."""
+    """Preset of the spline motion."""
     drives: bool = False
-    """Whether it moves forward and turns about the vertical axis, both within a few degrees."""
+    """Whether the rig translates forward and rotates about the vertical axis, both within a few degrees."""
 
 
 KINDS = {
@@ -144,20 +144,20 @@ KINDS = {
     "drone": RigKind(752, 480, 458.0, (0.06, 0.2), (2.0, 20.0), (0.2, 8.0), (0.02, 0.5), "drone"),
 }
 MODELS_DRAWN = ("linear", "twist", "inertial", "accelerated", "spline")
-"""Motion models, each of a fifth of the problems of each kind of rig."""
+"""Motion models; each is used for a fifth of the problems of each type of rig."""
 _READOUT: Range = (0.1, 0.95)
 _CELLS = tuple((kind, model) for kind in KINDS for model in MODELS_DRAWN)
 _OF_A_CELL = 12
 _ACCELERATION = 0.4
-"""k of ``accelerated`` is uniform within this distance of 0."""
+"""Bound of the parameter k of ``accelerated``, which is uniform in [-bound, bound]."""
 _SLANT = 0.1
-"""Relative standard deviation of a car's direction from forward and of its axis from vertical."""
+"""Standard deviation of the noise on each component of a car's unit direction and rotation axis."""
 _SCOPE = ("leaderboard", "points-2")
 
 
 @lru_cache(maxsize=8)
 def _order(seed: int) -> NDArray[Any]:
-    """The cell of each problem, shuffled so that names do not reveal the motion model."""
+    """Return the index of the rig and motion model of each problem, shuffled so that names do not reveal it."""
     return generator(seed, *_SCOPE, "order").permutation(len(_CELLS) * _OF_A_CELL) % len(_CELLS)
 
 
@@ -167,7 +167,7 @@ def _cell(seed: int, number: int) -> tuple[str, str]:
 
 @lru_cache(maxsize=512)
 def setting_by_kind(seed: int, number: int) -> Setting:
-    """points-2: a kind of rig with a motion model, equally many problems for each combination."""
+    """Return a setting of points-2; each type of rig with each motion model has equally many problems."""
     name, model = _cell(seed, number)
     kind, rng = KINDS[name], generator(seed, *_SCOPE, "setting", number)
     ahead = np.array([0.0, 0.0, 1.0]) + _SLANT * rng.standard_normal(3)
@@ -204,7 +204,7 @@ POINTS_2 = Draws(
 
 
 class DrawnPoints(Inputs):
-    """Tracks of random points: the split ``dev``, or with a secret seed the split ``test``."""
+    """Inputs of simulated points: the split ``dev``, or the split ``test`` if the seed is secret."""
 
     rendered = False
 
@@ -223,16 +223,16 @@ class DrawnPoints(Inputs):
 
     @abstractmethod
     def draws_of(self, data: Path | None) -> Draws:
-        """The problems, by the folder that the option ``--data`` names.
+        """Return the generator of problems for the folder of the option ``--data``.
 
         Raises:
-            RsbenchError: the track takes no folder, or this one is at fault.
+            RsbenchError: the track takes no folder, or the folder is invalid.
         """
 
 
 @dataclass(frozen=True)
 class SimulatedPoints(DrawnPoints):
-    """Points under motion models, from a seed alone."""
+    """Simulated points under motion models, determined by a seed alone."""
 
     draws: Draws
 
@@ -257,7 +257,7 @@ def _truth(draws: Draws, seed: int, number: int) -> Truth:
 
 
 def seed_of(path: Path | None) -> int:
-    """The seed made from the text of a file; without one, that of the public split.
+    """Compute the seed from the text of a file; without a file, return the seed of the public split.
 
     Raises:
         RsbenchError: the file cannot be read, or its text is too short to be a secret.
@@ -273,10 +273,10 @@ def seed_of(path: Path | None) -> int:
 
 
 def simulated_problem(seed: int, number: int, draws: Draws = POINTS_1) -> Problem:
-    """The matches of one problem: tracks only, of which a method uses what it needs.
+    """Simulate the matches of one problem. It has tracks only, from which each method takes its inputs.
 
     Raises:
-        RsbenchError: the motion leaves too few points in view; another seed is needed.
+        RsbenchError: too few points are in view under the motion; another seed is needed.
     """
     found = _simulated(draws, draws.setting(seed, number), seed, number)
     return Problem(
@@ -284,16 +284,16 @@ def simulated_problem(seed: int, number: int, draws: Draws = POINTS_1) -> Proble
     )
 
 
-@lru_cache(maxsize=512)  # the bounds of all that methods use need the same problems
+@lru_cache(maxsize=512)  # bounds for different inputs use the same problems
 def exact_problem(seed: int, number: int, draws: Draws = POINTS_1) -> tuple[Problem, float]:
-    """The matches of a problem without noise and without the outliers, and the noise that they get, px.
+    """Return a problem with noise-free inliers only, and the standard deviation of its noise, px.
 
     Raises:
         RsbenchError: as ``simulated_problem``.
     """
     setting = draws.setting(seed, number)
     found = _simulated(draws, setting.exact(), seed, number)
-    # Outliers are displaced after the noise by the same draws, so without noise they are the same matches.
+    # Outliers are displaced after the noise is added, by the same draws; so the same matches are outliers here.
     inliers = Correspondences(tracks=found.correspondences.tracks[~found.outliers["tracks"]])
     problem = Problem(name=_name(number), correspondences=inliers, rig=found.rig, known_shutter=found.shutter)
     return problem, setting.noise_px
@@ -326,12 +326,12 @@ def _sizes(motion: Motion, rig: StereoRig, shutter: RollingShutter) -> dict[str,
 
 @dataclass(frozen=True)
 class Frames(Inputs):
-    """Pairs of frames of the sequences of a dataset, with given matches unless the frames are given."""
+    """Inputs of frame pairs of a dataset: matches, or the frames themselves on tracks that give them."""
 
     distinct_ratios: bool = False
-    """Whether all sequences must have different readout ratios, so that a constant answer cannot win."""
+    """Whether all sequences must have different readout ratios, so that a constant answer scores badly."""
     any_rig: bool = False
-    """Whether the two cameras may have lenses and may differ in scan and size."""
+    """Whether cameras may have lens distortion and may differ in scan direction and image size."""
 
     def split(self, track: Track, data: Path | None, seed_file: Path | None, secret: bool) -> Split:
         folder = _dataset_of(track, data, seed_file)
@@ -355,16 +355,16 @@ class Frames(Inputs):
             yield with_gyro(problem, sequence) if "gyro" in track.allowed else problem
 
     def given(self, track: Track, folder: Path) -> list[Sequence]:
-        """The sequences of the problems as methods get them."""
+        """Return the sequences of the problems as they are given to methods."""
         return self.pairs(track, folder)
 
     def pairs(self, track: Track, folder: Path) -> list[Sequence]:
-        """The pairs of frames that are problems of the track."""
+        """Return the frame pairs that are problems of the track."""
         return read_pairs(folder)
 
 
 class WholeSequences(Inputs):
-    """Whole sequences of a dataset, as windows of two frames with given matches."""
+    """Inputs of whole sequences of a dataset: windows of two frames with given matches."""
 
     whole = True
 
@@ -384,7 +384,7 @@ class WholeSequences(Inputs):
         return Split(track=track, label=label_of(folder), public=not secret, truths=tuple(truths))
 
     def problems(self, track: Track, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
-        """The windows of the first ``count`` sequences; the first window has all samples of the gyroscope."""
+        """Yield the windows of the first ``count`` sequences; the first window has all gyroscope samples."""
         assert data is not None
         options = CorrectionOptions(features=load_features(FEATURES))
         for sequence in read_dataset(data)[:count]:
@@ -397,7 +397,7 @@ class WholeSequences(Inputs):
 
 
 def _dataset_of(track: Track, data: Path | None, seed_file: Path | None) -> Path:
-    """Folder of the dataset. Raises RsbenchError where the options name none, or another source."""
+    """Return the dataset folder; RsbenchError if ``--data`` is missing or ``--seed-file`` is given."""
     if data is None:
         raise RsbenchError(
             f"--data: the track {track.name!r} needs the folder of a dataset; make one with rsbench generate"
@@ -408,7 +408,7 @@ def _dataset_of(track: Track, data: Path | None, seed_file: Path | None) -> Path
 
 
 def label_of(folder: Path) -> str:
-    """The label of a dataset's split: its name. Raises RsbenchError where that cannot be one, or is missing."""
+    """Return the name of a dataset, which labels its split; RsbenchError if it is invalid or missing."""
     return _checked_name(read_dataset_manifest(folder).name, folder / "dataset.json")
 
 
@@ -419,7 +419,7 @@ def _checked_name(name: str, where: Path) -> str:
 
 
 def truth_of(sequence: Sequence, pictures: TruePictures | None = None) -> Truth:
-    """The ground truth of a sequence, with the true pictures on tracks of pictures."""
+    """Return the ground truth of a sequence; on tracks of pictures it includes the true pictures."""
     scene = sequence.manifest.get("scene")
     named = scene.get("name") if isinstance(scene, dict) else None
     facts = {
@@ -441,10 +441,10 @@ def truth_of(sequence: Sequence, pictures: TruePictures | None = None) -> Truth:
 def _true_pictures(
     folder: Path, sequences: Iterable[Sequence], track: Track, any_rig: bool
 ) -> dict[str, TruePictures]:
-    """True pictures by the names of the sequences of a dataset.
+    """Return the true pictures of each sequence of a dataset, by its name.
 
     Raises:
-        RsbenchError: dataset.json lists no such file; the cameras have a lens or other scans, or objects move.
+        RsbenchError: dataset.json lacks a file, a rig is not supported by the track, or objects move.
     """
     listed = read_dataset_manifest(folder).files
     found = {}
@@ -469,10 +469,10 @@ def _true_pictures(
 
 
 def find_problem(sequence: Sequence, options: CorrectionOptions | None) -> Problem:
-    """Two frames as a problem, with matches by the matcher of ``options``.
+    """Return two frames as a problem, with matches by the feature matcher of ``options``.
 
-    There are none without ``options``, where methods find their own, and where the frames show no texture, so that
-    every method fails.
+    Without ``options`` there are no matches, because methods find their own. There are none either if the frames
+    have too little texture, and every method then fails.
     """
     matches = Correspondences()
     if options is not None:
@@ -483,10 +483,10 @@ def find_problem(sequence: Sequence, options: CorrectionOptions | None) -> Probl
 
 
 def with_gyro(problem: Problem, sequence: Sequence) -> Problem:
-    """A problem with the samples of a gyroscope, if any, around its two frames, at times of its own."""
+    """Add the gyroscope samples around the two frames, if there are any, in frame periods from its first frame."""
     if _GYRO not in sequence.manifest.get("channels", ()):
         return problem
-    whole = replace(sequence, channels=(_GYRO,))  # two frames of a longer sequence list no channel of them all
+    whole = replace(sequence, channels=(_GYRO,))  # a pair does not list the channels of its sequence
     samples = gyro_samples(whole.inertial(), sequence.frame_period_s) - [sequence.first, 0.0, 0.0, 0.0]
     near = (samples[:, 0] > -_AROUND) & (samples[:, 0] < len(FRAMES) + _AROUND)
     return replace(problem, correspondences=replace(problem.correspondences, gyro=samples[near]))

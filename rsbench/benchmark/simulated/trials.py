@@ -46,7 +46,7 @@ class Entrant:
 
 
 def enter(entry: SolverEntry) -> Entrant:
-    """A solver with the least information that it can use completely.
+    """Return a solver and the kind of matches that it gets: the simplest one with all match sets that it uses.
 
     Raises:
         RsbenchError: another package's solver does not state how many matches it needs.
@@ -64,7 +64,7 @@ def enter(entry: SolverEntry) -> Entrant:
 
 
 def given_matches(simulation: Simulation, information: Information) -> Correspondences:
-    """The part of the simulated matches that ``information`` names."""
+    """Select the simulated matches of the kind ``information``."""
     c = simulation.correspondences
     if information == "tracks":
         return Correspondences(tracks=c.tracks)
@@ -154,7 +154,7 @@ def _simulation(setting: Setting, entrants: list[Entrant], seed: int, trial: int
 
 
 def _bounds(simulation: Simulation, kinds: set[Information]) -> dict[Information, Bound]:
-    """Bounds at 1 px for the matches of each kind of information."""
+    """Return bounds for a noise of 1 px and the matches of each kind of input."""
     c, rig, motion = simulation.correspondences, simulation.rig, simulation.motion
     good = {name: getattr(c, name)[~simulation.outliers[name]] for name in ("left", "right", "tracks")}
 

@@ -27,16 +27,16 @@ from rsbench.storage.files import write_bytes
 MEASURES = ("e_R", "e_T")
 Centre = Literal["mean", "median"]
 TINY = 0.25
-"""Largest small increase, as a share of the eight-point algorithm's error without noise."""
+"""Limit of a small increase, as a share of the eight-point algorithm's error without noise."""
 UNCHANGED = 1.5
-"""Largest quotient of two errors that count as unchanged."""
+"""Limit of the ratio of two errors that count as equal."""
 SUFFICIENT_SHARE, UNIQUE_SHARE = 0.9, 0.95
 SCALE_MARGIN = 0.1
-"""Largest median of abs(log(estimated / true length of d)) for a known scale."""
+"""Limit of the median of abs(log(estimated / true length of d)) if the scale counts as known."""
 
 
 class Figure(NamedTuple):
-    """A statistic with its 95 % interval, of width 0 if it is exact; NaN if it is not observable."""
+    """A statistic with its 95 % interval, which has the width 0 if it is exact; NaN if it is not observable."""
 
     value: float
     low: float
@@ -49,7 +49,7 @@ class Figure(NamedTuple):
 
 
 class Check(NamedTuple):
-    """Whether a claim holds at one value of the axis, or for one quantity; None: undecided."""
+    """Result of a claim at one value of the axis, or for one quantity; None: undecided."""
 
     label: str
     holds: bool | None
@@ -114,7 +114,7 @@ def series(table: pd.DataFrame, solver: str, variant: str, centre: Centre) -> Se
 
 
 def verdict(checks: Sequence[Check], axis: str) -> str:
-    """ "holds", "fails", "undecided", or the values of the axis or quantities for which each is true."""
+    """Return "holds", "fails", "undecided", or these with the values or quantities for which they are true."""
     parts = {
         word: [check for check in checks if check.holds is holds]
         for word, holds in (("holds", True), ("undecided", None), ("fails", False))
@@ -140,24 +140,24 @@ def _where(good: Sequence[Check], checks: Sequence[Check], axis: str) -> str:
 
 
 def better(a: Figure, b: Figure) -> bool | None:
-    """Whether a is smaller than b; None if the intervals overlap. NaN (not observable) counts as larger."""
+    """Return whether a is smaller than b; None if the intervals overlap. NaN (not observable) counts as larger."""
     if math.isnan(a.value) or math.isnan(b.value):
         return None if math.isnan(a.value) and math.isnan(b.value) else math.isnan(b.value)
     return True if a.high < b.low else False if b.high < a.low else None
 
 
 def within(low: float, high: float, margin: float) -> bool | None:
-    """Whether an interval lies below a margin; None if it contains the margin."""
+    """Return whether an interval lies below a margin; None if it contains the margin."""
     return True if high <= margin else False if low > margin else None
 
 
 def all_of(parts: Sequence[bool | None]) -> bool | None:
-    """False if any part is False, else None if any is None, else True."""
+    """Return False if any part is False, else None if any part is None, else True."""
     return False if False in parts else None if None in parts else True
 
 
 def small_increase(ours: Series, other: Series) -> list[Check]:
-    """At each value, errors exceed those at the smallest one by less than ``TINY`` of the other's error there."""
+    """Check, per value, that errors grow from the first value by less than ``TINY`` of the other's error there."""
     later = range(1, len(ours.values))
     rises = [[_rise(ours[m], k, TINY * other[m][0].value) for m in MEASURES] for k in later]
     return ours.checks([all_of(rise) for rise in rises], 1)
@@ -169,17 +169,17 @@ def _rise(figures: Sequence[Figure], k: int, margin: float) -> bool | None:
 
 
 def always_better(ours: Series, other: Series) -> list[Check]:
-    """At each value both errors are smaller than the other's."""
+    """Check, per value, that both errors are smaller than those of the other solver."""
     return _at_each(ours, other, better)
 
 
 def more_stable(ours: Series, other: Series) -> list[Check]:
-    """Per error: its range over the values is smaller than the other's."""
+    """Check, per error, that its range over the values is smaller than that of the other solver."""
     return [Check(m, better(_range(ours[m]), _range(other[m]))) for m in MEASURES]
 
 
 def both_grow(ours: Series, other: Series) -> list[Check]:
-    """Per solver and error: it is larger at the last value than at the first, and decreases nowhere."""
+    """Check, per solver and error, that it grows from the first to the last value and never decreases."""
     sides = (("RS", ours), ("GS", other))
     return [Check(f"{m} of {who}", _grows(s[m])) for who, s in sides for m in MEASURES]
 
@@ -190,7 +190,7 @@ def _grows(figures: Sequence[Figure]) -> bool | None:
 
 
 def hardly_changes(ours: Series, other: Series) -> list[Check]:
-    """Per error: the largest is at most ``UNCHANGED`` times the smallest."""
+    """Check, per error, that the largest one is at most ``UNCHANGED`` times the smallest one."""
     checks = []
     for m in MEASURES:
         small, large = (extreme(ours[m], key=lambda figure: figure.value) for extreme in (min, max))
@@ -200,7 +200,7 @@ def hardly_changes(ours: Series, other: Series) -> list[Check]:
 
 
 def no_worse(ours: Series, other: Series) -> list[Check]:
-    """At each value both errors are at most ``UNCHANGED`` times the other's."""
+    """Check, per value, that both errors are at most ``UNCHANGED`` times those of the other solver."""
     return _at_each(ours, other, _quotient)
 
 
@@ -214,23 +214,23 @@ def _quotient(a: Figure, b: Figure) -> bool | None:
 
 
 def enough_solved(ours: Series, other: Series) -> list[Check]:
-    """At each value the share of solved trials is at least ``SUFFICIENT_SHARE``."""
+    """Check, per value, that the share of solved trials is at least ``SUFFICIENT_SHARE``."""
     return ours.checks([_at_least(share, SUFFICIENT_SHARE) for share in ours["solved"]])
 
 
 def one_solution(ours: Series, other: Series) -> list[Check]:
-    """At each value the share of trials with one solution is at least ``UNIQUE_SHARE``."""
+    """Check, per value, that the share of trials with one solution is at least ``UNIQUE_SHARE``."""
     return ours.checks([_at_least(share, UNIQUE_SHARE) for share in ours["answered"]])
 
 
 def scale_known(ours: Series, other: Series) -> list[Check]:
-    """At each value the median of e_s is at most ``SCALE_MARGIN``."""
+    """Check, per value, that the median of e_s is at most ``SCALE_MARGIN``."""
     known = [not math.isnan(f.value) and within(f.low, f.high, SCALE_MARGIN) for f in ours["e_s"]]
     return ours.checks(known)
 
 
 def beats_one_camera(ours: Series, other: Series) -> list[Check]:
-    """Per error at the first value: its root mean square is below the bound for the matches of one camera."""
+    """Check, per error at the first value, that its root mean square is below the bound for one camera."""
     return [Check(f"e_{m}", better(ours[f"rms_{m}"][0], other[f"bound_{m}"][0])) for m in "RT"]
 
 
@@ -683,7 +683,7 @@ class ImageClaim:
 
 
 def motion_on_images(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
-    """Per sequence: both errors of a solver below those of gs-8pt (medians where there are several runs)."""
+    """Check, per sequence, that both errors are below those of gs-8pt (medians if there are several runs)."""
     runs = table.groupby(["solver", "sequence"], sort=False)[["e_R_deg", "e_T_deg"]]
     errors, shown = runs.median(), runs.agg(median_and_quartiles)
     baseline, found = errors.loc["gs-8pt"], dict[str, tuple[list[Check], str]]()
@@ -701,7 +701,8 @@ def _in_degrees(shown: pd.DataFrame) -> str:
 
 
 def sgm_is_accurate(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
-    """Per sequence and motion, cameras in step: median disparity error and share of pixels 2 m off."""
+    """Check, per sequence and motion, the median disparity error and the share of depth errors above 2 m, for
+    synchronised cameras."""
     rows = table[(table["delay"] == 0.0) & ~table["opposite"].astype(bool)].to_dict("records")
     checks = [
         Check(
@@ -720,7 +721,7 @@ def sgm_is_accurate(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
 
 
 def almost_coincides(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
-    """Per sequence: PSNR of the corrected views, from estimated motion and SGM depth."""
+    """Check, per sequence, the PSNR of views corrected with estimated motion and SGM depth."""
     rows = table[(table["corrector"] == "fusion") & (table["matcher"] == "sgm") & (table["solver"] != "true")]
     found = {}
     for solver, own in rows.groupby("solver", sort=False):
@@ -733,7 +734,7 @@ def almost_coincides(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
 
 
 def coincides_literally(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
-    """Per RANSAC seed: PSNR of views corrected by the paper's own components, see ``correct_literally``."""
+    """Check, per RANSAC seed, the PSNR of views corrected with the paper's components: ``correct_literally``."""
     means = table.groupby("ransac_seed", sort=False)
     by = "; ".join(", ".join(row) for row in table[list(fig4_panels.LITERAL)].drop_duplicates().to_numpy())
     found = {}
@@ -746,7 +747,7 @@ def coincides_literally(table: pd.DataFrame) -> dict[str, tuple[list[Check], str
 
 
 def stereo_corrects_better(table: pd.DataFrame) -> dict[str, tuple[list[Check], str]]:
-    """Per stratum: the paired gain of ours over a method, interval apart from 0; few sequences have none."""
+    """Check, per stratum, that the interval of our paired gain over a method is above 0, where it is finite."""
     table = table[table["gain_low"] > float("-inf")]
     found = {}
     for method, name in (("mono", "against one camera"), ("plane", "against one plane")):

@@ -1,4 +1,4 @@
-"""Inputs that the methods of the correction study share on one sequence: frames, matches, motions and depths."""
+"""Methods of the correction study, and the inputs that they share on a sequence: matches, motions and depths."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ Rows = tuple[list[Row], list[Row], list[Row]]
 
 
 def rows_identity(dataset: Path, name: str, **options: object) -> str:
-    """Identity of the rows of a sequence: they are current while code, packages, data and ``options`` are."""
+    """Return a hash of code, packages, data and ``options``; stored rows with the same hash are up to date."""
     benchmark = Path(str(resources.files("rsbench"))) / "benchmark"
     return identity_of(
         numeric=numeric_version(),
@@ -65,16 +65,16 @@ def rows_identity(dataset: Path, name: str, **options: object) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """One line of the table."""
+    """A correction method, which is a row of the tables."""
 
     key: str
     title: str
     kind: str
     """``none``, ``baseline``, ``ours``, ``law`` (ours, given a motion model) or ``oracle``."""
     knows: str
-    """What it assumes or is given."""
+    """Assumptions and inputs of the method."""
     slow_scores: bool = False
-    """Whether FLIP and the SSIM of other protocols are computed, for the best of each family."""
+    """Whether FLIP and the SSIM of other protocols are computed, as for the best methods of each family."""
 
 
 METHODS = (
@@ -162,7 +162,7 @@ ON_REQUEST = (
 
 
 def methods_among(keys: Collection[str]) -> list[Method]:
-    """The methods of these keys, in the order of tables."""
+    """Return the methods with these keys, in the order of the tables."""
     return [method for method in (*METHODS, *ON_REQUEST) if method.key in keys]
 
 
@@ -173,12 +173,12 @@ _OF_LAW = {"linear": "rs-stereo-refined", "twist": "rs-stereo-refined-twist"}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attempt:
-    """One view as corrected by a method."""
+    """A view corrected by a method."""
 
     image: NDArray[Any]
-    """(H, W, C), every pixel."""
+    """(H, W, C) corrected image, complete."""
     covered: NDArray[np.bool_]
-    """(H, W) pixels drawn from the frame itself at a depth that was not guessed."""
+    """(H, W) mask of the pixels drawn from the frame itself with an estimated or true depth."""
     flow: NDArray[np.float32]
     """(H, W, 2) displacement of the pixels of the rolling-shutter frame, px; NaN where unknown."""
 
@@ -199,17 +199,17 @@ class Bench:
 
     @cached_property
     def scaled(self) -> FoundMotion | None:
-        """The global-shutter motion of matches scaled to one frame period."""
+        """Motion estimated for a global shutter from matches scaled to one frame period."""
         return self._found("gs-scaled", self._own_law(_SCALED))
 
     @cached_property
     def of_law(self) -> dict[str, FoundMotion | None]:
-        """Motions by the motion model that is assumed."""
+        """Estimated motions by the assumed motion model."""
         return {law: self._found("rs", self._own_law(name)) for law, name in _OF_LAW.items()}
 
     @cached_property
     def gs_motion(self) -> Motion | None:
-        """The global-shutter motion."""
+        """Motion estimated for a global shutter."""
         rng = generator(self._seed, "study", self.sequence.name, "gs")
         return global_shutter_motion(self.matches, self.rig, self.options.robust, rng)
 
@@ -219,7 +219,7 @@ class Bench:
         return true_pairs(self.sequence, self.images)
 
     def _own_law(self, solver: str) -> CorrectionOptions:
-        """Options with a solver that keeps its own motion model, whichever model fits the matches best."""
+        """Return options with a solver that uses its own motion model, even if another one fits better."""
         return replace(self.options, solver=load_solver_entry(solver), motion_model=None)
 
     def _found(self, name: str, options: CorrectionOptions) -> FoundMotion | None:
@@ -235,7 +235,7 @@ class Bench:
         return _motion(self.found)
 
     def motion_errors(self) -> Row:
-        """e_R and e_T, degrees, of our motion and of the global-shutter motions; failures get the worst scores."""
+        """Return e_R and e_T, degrees, of all estimated motions; failures get the worst scores."""
         row: Row = {}
         motions = {"ours": self.motion, "gs": self.gs_motion, "gs_scaled": _motion(self.scaled)}
         for name, motion in (motions | {law: _motion(found) for law, found in self.of_law.items()}).items():
@@ -244,7 +244,7 @@ class Bench:
         return row
 
     def attempt(self, key: str) -> dict[View, Attempt] | None:
-        """The views corrected by one method, without those that lack a motion; None if all do."""
+        """Return the views corrected by a method, except views without a motion; None if its motion is missing."""
         true = self.sequence.motion
         if key == "none":
             return self._nothing()
@@ -274,8 +274,8 @@ class Bench:
     def corrected(
         self, pairs: Pairs, motion: Motion, corrector: str = "fusion", views: tuple[View, ...] = VIEWS
     ) -> tuple[dict[View, Fused], Pairs]:
-        """Frames corrected with a depth and a motion, and the depth that the corrector used."""
-        # Simpler corrections use one camera's frame, without depth from two.
+        """Correct frames with a depth and a motion; also return the depth that the corrector used."""
+        # The simpler correctors use one camera, so unknown depth is not estimated from the motion.
         options = replace(
             self.options, corrector=load_corrector(corrector), depth_from_motion=corrector == "fusion"
         )
@@ -304,7 +304,7 @@ class Bench:
         return ZhuangCorrector(seed=self._seed).motion(self.matches, self.rig, self.shutter, side)
 
     def _problem(self) -> CorrectionProblem:
-        """The frames and their matches, with nothing estimated from them."""
+        """Return the problem with frames and matches, without estimated motion or depth."""
         return CorrectionProblem(
             images=self.images,
             rig=self.rig,
@@ -317,7 +317,7 @@ class Bench:
         )
 
     def _layers(self, key: str) -> dict[View, Attempt]:
-        """The views of the cameras for which the corrector by layers found a scene."""
+        """Return the views of the cameras for which the corrector by layers found a scene."""
         corrector = load_corrector(key).component
         assert isinstance(corrector, LayersCorrector)
         corrector, problem, out = replace(corrector, seed=self._seed), self._problem(), dict[View, Attempt]()
@@ -334,10 +334,10 @@ class Bench:
         return out
 
     def _rotation(self, key: str, view: View) -> Motion | None:
-        """The rotation of a frame by the gyroscope or by a corrector of one image; None when that fails.
+        """Return the rotation of a frame from the gyroscope or a single-image corrector; None if it fails.
 
         Raises:
-            RsbenchError: the sequence has no channel imu.
+            RsbenchError: the sequence has no channel ``imu``.
         """
         sequence = self.sequence
         if key == "gyroscope":
@@ -395,7 +395,7 @@ _DEPTHS: dict[str, Callable[[Depth], Depth]] = {
     "rotation": _infinitely_far,
     "plane": plane_depth,
 }
-"""Depth that a method's corrector uses to move pixels, as a function of the given depth."""
+"""Functions from the estimated depth to the depth with which a method's corrector moves pixels."""
 
 
 def _attempt(fused: Fused, flow: NDArray[np.float32]) -> Attempt:

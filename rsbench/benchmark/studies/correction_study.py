@@ -1,7 +1,7 @@
 """The correction study: all correctors on the same frames, matches and pixels.
 
-A method combines a depth, a motion and a corrector of the chain. Methods that know the scene fill pixels that a
-frame did not see from the other frames; the remaining pixels are inpainted, so that every method gives a
+A method combines a depth, a motion and a corrector of the chain. Methods with depth and motion fill pixels that
+are not visible in a frame from the other frames; the remaining pixels are inpainted, so that every method gives a
 complete image. 'All' scores the complete image. 'Covered' scores the pixels that every method draws from the frame
 itself, without filling or inpainting. A method that finds no motion gets the worst scores and does not reduce the
 covered pixels of the others; neither do the optional methods (``ON_REQUEST``).
@@ -51,16 +51,16 @@ SCORES = (
 
 
 def by_sequence(images: pd.DataFrame) -> pd.DataFrame:
-    """Mean of the views: one row per stratum, sequence and method; ``success`` is the share of views."""
+    """Average the scores over views: one row per stratum, sequence and method; ``success`` is a share of views."""
     keys = ["stratum", "sequence", "method"]
     return images[[*keys, *SCORES, "common", "success"]].groupby(keys, as_index=False, sort=False).mean()
 
 
 def summarise(images: pd.DataFrame) -> pd.DataFrame:
-    """One row per stratum and method: median over sequences of each score with its 95 % interval.
+    """Return one row per stratum and method: the median of each score over sequences and its 95 % interval.
 
-    ``gain`` is the paired difference of the covered PSNR, ours minus the method, and ``gain_all`` that of all
-    pixels. ``failures`` counts the sequences on which a method failed; they are in the scores, with the worst.
+    ``gain`` is the paired difference of the covered PSNR, ours minus the method; ``gain_all`` is that over all
+    pixels. ``failures`` counts the sequences in which a method failed; these have the worst scores.
     ``images`` has the rows of ``study_dataset`` and a column ``stratum``.
     """
     table = by_sequence(images)
@@ -80,14 +80,14 @@ def summarise(images: pd.DataFrame) -> pd.DataFrame:
 
 
 def masks(images: pd.DataFrame) -> pd.DataFrame:
-    """Per stratum, the median and the minimum over views of the share of pixels that every method covers."""
+    """Return, per stratum, the median and minimum over views of the share of pixels that all methods cover."""
     common = images.groupby(["stratum", "sequence", "side", "frame"], sort=False)["common"].first()
     shares = common.groupby("stratum", sort=False)
     return pd.DataFrame({"median": shares.median(), "least": shares.min()}).reset_index()
 
 
 def by_scene(images: pd.DataFrame) -> pd.DataFrame:
-    """Per stratum, scene and method: ``summarise`` of the scene's sequences.
+    """Return ``summarise`` for the sequences of each scene: one row per stratum, scene and method.
 
     A sequence is named after its scene and its seed: ``castle-2``.
     """
@@ -100,21 +100,21 @@ def by_scene(images: pd.DataFrame) -> pd.DataFrame:
 
 
 def by_law(images: pd.DataFrame) -> pd.DataFrame:
-    """``summarise`` of sequences of the card ``laws``, a stratum for each law and size of its motions."""
+    """Return ``summarise`` for sequences of the card ``laws``; each motion model and size is a stratum."""
     return summarise(images.assign(stratum=law_and_size(images)))
 
 
 def law_and_size(table: pd.DataFrame) -> pd.Series:
-    """Text such as ``twist, moderate`` for each row of a table of sequences of the card ``laws``.
+    """Return a text such as ``twist, moderate`` for each row of a table of sequences of the card ``laws``.
 
-    A sequence is named after its scene, law, size, sensor and seed: ``old-town-twist-moderate-ideal-1``.
+    A sequence is named after its scene, motion model, size, sensor and seed: ``old-town-twist-moderate-ideal-1``.
     """
     names = table["sequence"].str.rsplit("-", n=4, expand=True)
     return names[1] + ", " + names[2]
 
 
 def _interval(name: str, values: FloatArray) -> dict[str, float]:
-    """Median and its interval; NaN if no value is finite."""
+    """Return the median of the finite values and its interval; NaN if no value is finite."""
     known = values[np.isfinite(values)]
     if len(known) == 0:
         return with_ends(name, np.nan, np.nan, np.nan)
@@ -122,13 +122,14 @@ def _interval(name: str, values: FloatArray) -> dict[str, float]:
 
 
 def summarise_bands(bands: pd.DataFrame) -> pd.DataFrame:
-    """Mean flow error, px, over the views of each stratum, method and band of rows."""
+    """Average the flow error, px, over the views of each stratum, method and band of rows."""
     keys = ["stratum", "method", "band"]
     return bands[[*keys, "flow_mean_px"]].groupby(keys, as_index=False, sort=False).mean()
 
 
 def loss_to_true_motion(images: pd.DataFrame) -> pd.DataFrame:
-    """Per stratum, the median and the largest loss in dB of single views to the true motion on the same depth."""
+    """Return, per stratum, the median and the maximum over views of the PSNR lost, dB, relative to a correction
+    with the true motion and the same depth."""
     keys = ["stratum", "sequence", "side", "frame"]
     wide = images.pivot_table(index=keys, columns="method", values="psnr_covered", sort=False)
     loss = (wide["true-motion"] - wide["ours"]).groupby("stratum", sort=False)
@@ -136,7 +137,7 @@ def loss_to_true_motion(images: pd.DataFrame) -> pd.DataFrame:
 
 
 def verdict(summary: pd.DataFrame) -> pd.DataFrame:
-    """Per stratum and baseline: whether ours is better, by separate intervals and by the paired difference."""
+    """Return, per stratum and baseline, whether ours is better by disjoint intervals and by paired differences."""
     rows = []
     for stratum, group in summary.groupby("stratum", sort=False):
         ours = group[group["method"] == "ours"].iloc[0]
@@ -169,15 +170,15 @@ def study_dataset(
     others: tuple[str, ...] = (),
     among: Callable[[str], bool] = bool,
 ) -> Rows:
-    """Scores of every method on every view, errors by row band, and the motion errors, of all sequences.
+    """Compute scores of every method on every view, errors by row band, and motion errors, for all sequences.
 
-    ``solver`` names the solver of "our" motion, of the law that the matches prefer where it takes any. ``step`` is
-    called with the name of each sequence done; ``workers`` processes share them, one per core for None. A folder
-    ``kept`` holds what is done of a run that is cut off. ``others`` are keys of ``ON_REQUEST`` methods to have
-    too. ``among`` tells by its name whether a sequence takes part.
+    ``solver`` names the solver of "our" motion; if it supports several motion models, the one that fits best is
+    used. ``step`` is called with the name of each finished sequence. ``workers`` is the number of
+    processes; None: one per core. Finished sequences are stored in the folder ``kept``, so that an interrupted run
+    can be resumed. ``others`` are keys of additional ``ON_REQUEST`` methods. ``among`` selects sequences by name.
 
     Raises:
-        RsbenchError: the dataset cannot be read, or there is no such solver.
+        RsbenchError: the dataset cannot be read, or the solver does not exist.
         LostJobsError: see ``finished_jobs``.
     """
     sequences = {each.name: each for each in read_dataset(dataset) if among(each.name)}
@@ -199,14 +200,14 @@ def study_dataset(
 
 
 def _serve(dataset: Path, seed: int, solver: str, others: tuple[str, ...]) -> Callable[[str], Rows]:
-    """Function that scores a sequence by its name, in a child process."""
+    """Return the function that a child process calls to score a sequence, given its name."""
     return lambda name: study_sequence(read_sequence(dataset / name), seed, solver, others)
 
 
 def study_sequence(
     sequence: Sequence, seed: int = 0, solver: str = "rs-stereo-refined", others: tuple[str, ...] = ()
 ) -> Rows:
-    """The rows of ``study_dataset`` for one sequence."""
+    """Return the rows of ``study_dataset`` for one sequence."""
     bench = Bench(sequence, seed, solver)
     attempts = {key: bench.attempt(key) for key in (*(method.key for method in METHODS), *others)}
     images: list[Row] = []
@@ -248,7 +249,7 @@ def _image_rows(sequence: Sequence, view: View, attempts: dict[str, Attempt | No
 
 
 def _worst_scores(image: NDArray[Any], extra: bool) -> dict[str, float]:
-    """Scores of a failed method on an image, by the rule of docs/explanation/conventions.md."""
+    """Return the scores of a failed method on an image, as defined in docs/explanation/conventions.md."""
     scores = {f"{name}_{part}": WORST[name] for part in ("covered", "all") for name in ("psnr", "ssim")}
     scores |= {name: worst_flow(image) for name in ("flow_mean_px", "flow_median_px")}
     slow = {"flip_covered": "flip", "flip_all": "flip", "ssim_deepunroll": "ssim", "ssim_uniform": "ssim"}
@@ -257,12 +258,12 @@ def _worst_scores(image: NDArray[Any], extra: bool) -> dict[str, float]:
 
 
 def worst_flow(image: NDArray[Any]) -> float:
-    """The diagonal of an image (H, W[, C]), px: the largest error of a pixel that stays in the image."""
+    """Return the diagonal of an image (H, W[, C]), px: the largest flow error between pixels of the image."""
     return float(np.hypot(*image.shape[:2]))
 
 
 def _extra_scores(image: NDArray[Any], truth: NDArray[Any], common: Mask, wanted: bool) -> dict[str, float]:
-    """Slow scores, of one view per sequence and some methods: FLIP and SSIM by others' protocols."""
+    """Compute FLIP and the SSIM of other protocols if ``wanted``, else NaN; they are slow."""
     if not wanted:
         return dict.fromkeys(EXTRA, float("nan"))
     errors = flip(image, truth)
@@ -288,5 +289,5 @@ def _band_rows(attempts: dict[str, Attempt | None]) -> list[Row]:
 
 
 def flow_error(flow: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.float64]:
-    """End-point error (H, W), px; NaN where one of the flows is unknown."""
+    """Return the end-point error (H, W), px; NaN where one of the flows is unknown."""
     return np.linalg.norm(flow.astype(np.float64) - truth, axis=-1)

@@ -1,4 +1,4 @@
-"""Content of the paper's Figure 4 for one sequence: six pictures of the left camera's frame 0, and numbers."""
+"""Panels of the paper's Figure 4 for one sequence: six images for the left camera's frame 0, and numbers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ LITERAL = {
     "matcher": "sgm",
     "corrector": "single-view",
 }
-"""The components that the paper describes, by the name of their option."""
+"""Components described in the paper, by the name of their option."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,7 +52,7 @@ class Panels:
     rolling: NDArray[np.uint8]
     corrected: NDArray[np.uint8]
     known: NDArray[np.bool_]
-    """(H, W) pixels of ``corrected`` that some frame saw."""
+    """(H, W) mask of the pixels of ``corrected`` that are visible in at least one frame."""
     truth: NDArray[np.uint8]
     """The global-shutter image at row 0's pose."""
     true_depth: NDArray[np.float32]
@@ -62,7 +62,7 @@ class Panels:
 
 
 def make_panels(sequence: Sequence) -> Panels:
-    """Match, solve, estimate depth, correct, and compare with the truth.
+    """Match, solve, estimate depth, correct the frame, and compare it with the ground truth.
 
     If no motion is found, the uncorrected frame is shown, with the worst scores for the correction.
     """
@@ -74,7 +74,7 @@ def make_panels(sequence: Sequence) -> Panels:
 
 
 def literal_options(seed: int) -> CorrectionOptions:
-    """Options with the components of ``LITERAL``, without steps that the paper does not describe."""
+    """Return options with the components of ``LITERAL`` and without steps that the paper does not describe."""
     return CorrectionOptions(
         solver=load_solver_entry(LITERAL["solver"]),
         features=load_features(LITERAL["features"]),
@@ -87,13 +87,12 @@ def literal_options(seed: int) -> CorrectionOptions:
 
 
 def correct_literally(sequence: Sequence, seeds: Iterable[int]) -> Iterator[tuple[list[dict[str, Any]], Panels]]:
-    """For each seed of RANSAC: scores of the four views corrected with ``literal_options``; and the panels for one
-    seed.
+    """Correct the four views with ``literal_options``; yield the scores and the panels for each RANSAC seed.
 
-    A score is the PSNR, dB, on three sets of pixels: those ``drawn`` at an estimated depth, those ``visible`` in
-    the rolling-shutter frame by the true depth and motion, and ``all``; pixels that are not drawn are black. The
-    score of the uncorrected frame on the same pixels is listed too. If no motion is found, the scores are the
-    worst.
+    A score is the PSNR, dB, over three sets of pixels: ``drawn`` from the frame at an estimated depth, ``visible``
+    in the rolling-shutter frame according to the true depth and motion, and ``all``; pixels that are not drawn are
+    black. The PSNR of the uncorrected frame over the same pixels is also given. If no motion is found, the scores
+    are the worst ones.
     """
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     rolling = {view: Picture(image) for view, image in images.items()}
@@ -131,7 +130,7 @@ def correct_literally(sequence: Sequence, seeds: Iterable[int]) -> Iterator[tupl
 
 
 def _compare(sequence: Sequence, seed: int, motion: Motion | None, fused: Fused, pairs: Pairs) -> Panels:
-    """Panels of a frame that was corrected with ``motion`` and the depth of ``pairs``."""
+    """Return the panels of a frame that was corrected with ``motion`` and the depth of ``pairs``."""
     side, frame = VIEW
     rolling, truth = sequence.image("rs", *VIEW), sequence.image("gs", *VIEW)
     true_depth, found, success = sequence.depth("rs", *VIEW), pairs[frame].depth[side], motion is not None
@@ -157,7 +156,7 @@ def _compare(sequence: Sequence, seed: int, motion: Motion | None, fused: Fused,
         "psnr_rolling_all": psnr(rolling, truth),
         **{f"share_{name}": share for name, share in fused.shares().items()},
         **{
-            f"depth_{name}": None if math.isnan(value) else value  # without sky, or without any depth
+            f"depth_{name}": None if math.isnan(value) else value  # no sky, or no estimated depth
             for name, value in depth_metrics(depth, true_depth, sequence.rig).items()
         },
     }

@@ -1,8 +1,8 @@
-"""The default pipeline on the frames of a real camera and, beside them, on those of an ideal one.
+"""Comparison of the default pipeline on frames of a realistic camera and of an ideal camera.
 
-Both cameras move alike through the same scenes. The real one has a lens, exposes each row for a while, and counts
-photons. Motion is solved with several seeds of the robust loop. Frames are corrected with the motion of the seed
-whose largest error, in stated standard deviations, is the median of all, and of the seed where it is largest.
+Both cameras have the same motion in the same scenes. The realistic one has lens distortion, a finite exposure time
+and photon noise. Motion is solved with several RANSAC seeds. For each seed, the largest error is computed in units
+of its stated standard deviation; frames are corrected with the seeds for which it is the median and the maximum.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ from rsbench.vision.quality import psnr
 
 FEWEST_SEEDS = 10
 BEYOND = 4.0
-"""Stated standard deviations beyond which an error is not what was stated."""
+"""Number of stated standard deviations above which an error contradicts the stated covariance."""
 _CORRECTED: tuple[View, ...] = (("left", 0), ("left", 1))
 _LOST = {"psnr": 0.0, "psnr_clean": 0.0, "coverage": 0.0}
 
 
 def ideal_card(card: DatasetCard) -> DatasetCard:
-    """The same sequences as an ideal camera sees them; RsbenchError for a card with a rig of its own."""
+    """Return the card with an ideal camera, without lens and sensor; RsbenchError if the card has its own rig."""
     return replace(card, name=f"{card.name}-ideal", sensor=None, camera=replace(_camera(card), lens=None))
 
 
 def sized(card: DatasetCard, width: int) -> DatasetCard:
-    """The same sequences in images of this width, of the same field of view.
+    """Return the card with images of another width and the same field of view.
 
     Raises:
-        RsbenchError: so narrow that there is nothing to match, or a card with a rig of its own.
+        RsbenchError: the width is too small to find matches, or the card has its own rig.
     """
     camera = _camera(card)
     scale = width / camera.width
@@ -72,9 +72,9 @@ def _camera(card: DatasetCard) -> CameraCard:
 def study(
     datasets: Mapping[str, Path], seeds: int, step: Callable[[str], None], kept: Path
 ) -> tuple[list[Row], list[Row]]:
-    """A row for each seed, and one for each corrected view, of all sequences of the dataset of each camera.
+    """Evaluate all sequences of each camera's dataset; return a row per seed and a row per corrected view.
 
-    A folder ``kept`` holds what is done of a run that is cut off.
+    Finished sequences are stored in the folder ``kept``, so that an interrupted run can be resumed.
 
     Raises:
         RsbenchError: a dataset cannot be read.
@@ -97,7 +97,7 @@ def study(
 
 
 def study_sequence(sequence: Sequence, seeds: int) -> tuple[list[Row], list[Row]]:
-    """Errors of every seed, and scores of the corrected views."""
+    """Return the motion errors for every seed, and the scores of the corrected views."""
     options, rig, shutter = CorrectionOptions(), sequence.rig, sequence.shutter
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     matches = find_matches_of_rig(images, rig, shutter.scanning, options)
@@ -134,7 +134,7 @@ def _errors(sequence: Sequence, found: FoundMotion | None) -> Row:
 
 
 def largest_in_sigmas(off: FloatArray, covariance: FloatArray) -> float:
-    """The largest of errors (n,), each over its own stated standard deviation, from a covariance (n, n)."""
+    """Return the largest error of (n,) in units of its standard deviation, from a covariance (n, n)."""
     return float(np.max(np.abs(off) / np.sqrt(np.diag(covariance))))
 
 
@@ -154,7 +154,7 @@ def _corrected(
     motion: Motion | None,
     options: CorrectionOptions,
 ) -> list[Row]:
-    """PSNR of the pixels that are drawn, of the frames and of the clean ones, warped alike."""
+    """Return the PSNR, over the drawn pixels, of the corrected frames and of noise-free frames corrected alike."""
     keys = [{"side": side, "frame": frame} for side, frame in _CORRECTED]
     if motion is None:
         return [key | _LOST for key in keys]
@@ -179,15 +179,15 @@ def _corrected(
 
 
 def within_stated(motions: pd.DataFrame, camera: str) -> tuple[int, int]:
-    """How many sequences of a camera have no seed that fails or errs by more than ``BEYOND`` stated standard
-    deviations, and how many sequences there are."""
+    """Count the sequences of a camera in which no seed fails or has an error above ``BEYOND`` stated standard
+    deviations; return this count and the number of sequences."""
     own = motions[motions["camera"] == camera]
     worst = own["sigmas"].fillna(math.inf).groupby(own["sequence"]).max()
     return int(np.count_nonzero(worst <= BEYOND)), len(worst)
 
 
 def summarise(motions: pd.DataFrame, views: pd.DataFrame) -> pd.DataFrame:
-    """One row for each scene, stratum and camera: medians over sequences and seeds, and over views."""
+    """Return one row per scene, stratum and camera: median and worst errors over seeds, mean PSNR over views."""
     keys = ["scene", "stratum", "camera"]
     rows = []
     for values, group in motions.groupby(keys, sort=False):

@@ -1,16 +1,16 @@
 """Depth errors of semi-global matching when the two cameras do not read the same row at the same time.
 
-Both cameras of the rig share their rotation and differ by the baseline along the rows. A point that the left one
-sees at (x, y) at the time of row y is at that time at (x - f b / z, y) in the right one: on the same row. When the
-right camera reads that row at the same time, it sees the point there, whatever the motion is, so the pair is
-rectified and ``disparity = f b / z`` exactly.
+The cameras of the rig have the same rotation, and the baseline is parallel to the rows. If the left camera sees a
+point at (x, y) at the time of row y, the right camera projects it at that time to (x - f b / z, y), on the same
+row. If the right camera reads this row at the same time, it sees the point there under any motion, so the pair is
+rectified and ``disparity = f b / z`` is exact.
 
-When the right camera reads row y' at another time, the point has moved by the image velocity u (px per frame
-period) times the difference D: ``x' = x - f b / z + u_x D`` and ``y' = y + u_y D``, to first order. With a delay
-of delta frame periods ``D = delta + h (y' - y)``, hence ``D = delta / (1 - h u_y)``; read from the bottom up,
-``D = h (H - 1 - y' - y)``, hence ``D = h (H - 1 - 2 y) / (1 + h u_y)``: zero on the middle row, almost a whole
-readout at the upper and lower border. The disparity is wrong by ``-u_x D`` and the partner ``u_y D`` rows away,
-where the matcher does not look.
+If the right camera reads row y' at another time, the point has moved by the image velocity u (px per frame period)
+times the time difference D: to first order, ``x' = x - f b / z + u_x D`` and ``y' = y + u_y D``. For a delay of
+delta frame periods, ``D = delta + h (y' - y)``, hence ``D = delta / (1 - h u_y)``. For readout from the bottom to
+the top, ``D = h (H - 1 - y' - y)``, hence ``D = h (H - 1 - 2 y) / (1 + h u_y)``: zero in the middle row, and
+almost the whole readout time at the upper and lower border. The disparity error is ``-u_x D``, and the
+corresponding point lies ``u_y D`` rows away from the row that the matcher searches.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ DELAYS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Time at which the right camera reads its rows."""
+    """Times at which the right camera reads its rows."""
 
     delay: float = 0.0
-    """Frame periods after the left camera."""
+    """Delay of the right camera, frame periods."""
     opposite: bool = False
     """Whether it reads from the bottom row to the top row."""
 
@@ -51,8 +51,8 @@ class Timing:
         return shutter.row_time(rows, frame) + self.delay
 
     def lag(self, shutter: RollingShutter, y: FloatArray, velocity_y: FloatArray) -> FloatArray:
-        """Lag (...): time from when the left camera sees a point of the left row y to when the right one sees
-        it."""
+        """Return the time (...) between the observations of a point by the left camera, in row y, and by the
+        right camera."""
         if self.opposite:
             return (self.delay + shutter.h * (shutter.height - 1 - 2 * y)) / (1.0 + shutter.h * velocity_y)
         return self.delay / (1.0 - shutter.h * velocity_y)
@@ -74,10 +74,10 @@ def predicted_shift(
     motion: Motion,
     timing: Timing,
 ) -> FloatArray:
-    """Error of the disparity and rows by which the partner is off (H, W, 2), px, on the pixels of the left
-    camera's frame 0.
+    """Predict the disparity error and the vertical displacement of the corresponding point, (H, W, 2) px, for each
+    pixel of the left camera's frame 0.
 
-    ``depth`` (H, W) is the true one of the left frame, metres; NaN where it is 0.
+    ``depth`` (H, W) is the true depth of the left frame, m; the result is NaN where it is 0.
     """
     camera = rig.camera
     grid = camera.pixel_grid()
@@ -103,9 +103,10 @@ def compare(
     timing: Timing,
     options: SgmOptions | None = None,
 ) -> dict[str, Any]:
-    """Measured and predicted errors of SGM on a left frame and a right frame of this timing.
+    """Measure and predict the errors of SGM on a left frame and a right frame with this timing.
 
-    Both over the pixels with a disparity; ``unexplained_px`` is what the prediction leaves.
+    ``error_px``, ``predicted_px`` and ``unexplained_px`` (measured minus predicted) are medians of the absolute
+    disparity error over the pixels with a disparity.
     """
     disparity = stereo_disparity(left, right, rig, "left", options)
     error = disparity - rig.disparity(depth)

@@ -1,7 +1,7 @@
-"""Calibrations that consist of OpenCV's matrices: its own files, and camera_info of ROS.
+"""Readers of calibrations that consist of OpenCV's matrices: OpenCV's own files, and camera_info of ROS.
 
-**OpenCV** (FileStorage): x2 = R x1 + T, T in the unit of the board's squares, and no size of the images in the
-samples' files. Keys have various names, and a rotation may be a vector. If a file has only rectified cameras,
+**OpenCV** (FileStorage): x2 = R x1 + T, with T in the unit of the board's squares. Files of OpenCV's samples lack
+the image size. Keys have various names, and a rotation may be a vector. If a file has only rectified cameras,
 R = R2^T R1 and T = R2^T (P2[0, 3], P2[1, 3], 0) / f.
 
 **ROS** (camera_info of both cameras): extrinsics exist only as the rectification R of both and P[0, 3] = -f B.
@@ -43,7 +43,7 @@ _ROLES = (
     ("distortion", r"(d|k?d)(_?[lr012])?|d_\w+|\w*dist\w*", (4, 5, 8, 12, 14)),
     ("size", r"size|(image|img)_?size|resolution", (2,)),
 )
-"""Role, pattern of the key in lower case, and counts of numbers; camera matrices are recognised by their zeros."""
+"""Role, pattern of the lower-case key, and valid numbers of values; camera matrices are found by their zeros."""
 _ARRAYS = (np.ndarray, list)
 _FISHEYE = ("fisheye", "kannala_brandt", "equidistant")
 
@@ -82,17 +82,17 @@ class Parts:
 
     @staticmethod
     def number(tree: Any, name: str) -> float | None:
-        """``image_width`` or ``width``, likewise the height."""
+        """Return the value of ``image_NAME`` or NAME, such as ``image_width``; None without a number."""
         value = tree.get(f"image_{name}", tree.get(name)) if isinstance(tree, Mapping) else None
         return float(value) if isinstance(value, int | float) else None
 
     def one(self, role: str) -> FloatArray | None:
-        """The first value of a role; None where there is none."""
+        """Return the first value of a role; None if there is none."""
         return next(iter(self.values[role].values()), None)
 
     @property
     def apart(self) -> bool:
-        """Whether the files contain the relative pose of the cameras."""
+        """Whether the files define the relative pose of the cameras."""
         both = self.values["rotation"] and self.values["translation"]
         return bool(both) or {"r1", "r2", "p2"} <= self.values["rectified"].keys()
 
@@ -102,13 +102,13 @@ def _is_camera_matrix(K: FloatArray) -> bool:
 
 
 def is_opencv(tree: Any) -> bool:
-    """Whether a file has a camera matrix, or R and T."""
+    """Return whether a file has a camera matrix, or the relative pose of two cameras."""
     found = Parts(tree)
     return bool(found.matrices) or found.apart
 
 
 def opencv_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
-    """The file, and the one beside it with the missing part, as intrinsics.yml and extrinsics.yml of OpenCV."""
+    """Return the file and the one next to it with the missing part, such as OpenCV's extrinsics.yml."""
     own, others = Parts(near[path]), {each: tree for each, tree in near.items() if each != path}
     if (own.matrices and own.apart) or len(own.matrices) == 1:
         return {path: near[path]}
@@ -118,7 +118,7 @@ def opencv_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
 
 
 def read_opencv(files: Files) -> Calibration:
-    """One camera, or two with R and T or with their rectification."""
+    """Read one camera, or two cameras with R and T or with their rectification."""
     if len(files.trees) > 2:
         files.only()
     found, where = Parts(*files.trees.values()), files.where
@@ -137,7 +137,7 @@ def read_opencv(files: Files) -> Calibration:
 
 
 def _by_side(values: Mapping[str, FloatArray], where: str) -> dict[str, FloatArray]:
-    """Values by side, from two keys that differ only in l and r, left and right, 1 and 2, or 0 and 1."""
+    """Return values by side, from two keys that differ only in l and r, left and right, 1 and 2, or 0 and 1."""
 
     def differ(one: str, two: str) -> bool:
         a, b = (key.lower().replace("left", "l").replace("right", "r") for key in (one, two))
@@ -181,7 +181,7 @@ def _apart(found: Parts, where: str) -> Pose:
 
 
 def _apart_of_rectified(R1: FloatArray, R2: FloatArray, P2: FloatArray, where: str) -> Pose:
-    """``right_from_left`` from the rectifying rotations of both cameras and the second projection matrix."""
+    """Compute ``right_from_left`` from the rectifying rotations of both cameras and the second projection."""
     if not (P2[0, 0] > 0.0 and P2[1, 1] > 0.0):
         raise RsbenchError(f"{where}: projection: focal lengths {P2[0, 0]:g}, {P2[1, 1]:g}: must be positive")
     first, second = (rotation_of(R.ravel(), f"{where}: rectification") for R in (R1, R2))
@@ -201,7 +201,7 @@ _OTHER_SIDE += (("infra1", "infra2"), ("_0", "_1"), ("_1", "_2"), ("_l.", "_r.")
 
 
 def ros_files(path: Path, near: Mapping[Path, Any]) -> Mapping[Path, Any]:
-    """The file and that of the other camera, found by its name in this folder or in the folder beside it."""
+    """Return the file and that of the other camera, found by its name in this folder or in a sibling folder."""
     others = [each for each in near if each != path]
     for pair in _OTHER_SIDE:
         for one, other in (pair, pair[::-1]):

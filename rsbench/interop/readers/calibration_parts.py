@@ -1,9 +1,9 @@
-"""Shared parts of the calibration readers: files as trees, the result, and lenses, rotations and units of tools.
+"""Shared parts of the calibration readers: parsed files, the result, and conversion of lenses, poses and units.
 
-Files of any syntax become nested dicts, lists, texts and numbers: YAML (OpenCV's with its ``%YAML:1.0`` and tags
-too), JSON, OpenCV's XML, the sections of an INI file, and the lines of COLMAP's cameras.txt and rigs.txt. The
-syntax is recognised by the content, not by the file's name. A matrix, with ``rows`` and ``cols`` or ``sizes``, and
-``data``, becomes an array.
+Files of any syntax are parsed into nested dicts, lists, strings and numbers: YAML (also OpenCV's, with
+``%YAML:1.0`` and tags), JSON, OpenCV's XML, the sections of an INI file, and the lines of COLMAP's cameras.txt and
+rigs.txt. The syntax is recognised by the content, not by the file's name. A mapping with ``data`` and with
+``rows`` and ``cols``, or ``sizes``, is a matrix and becomes an array.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from rsbench.core.so3 import FloatArray
 from rsbench.storage.untrusted_files import MB, parse_json, read_text
 
 _LONGEST = 8 * MB
-"""Largest file, bytes; COLMAP lists a camera for each image of a collection."""
+"""Limit of the file size, bytes; COLMAP may list a camera for each image of a collection."""
 _DEEPEST = 16
-"""Deepest nesting of tables and lists."""
+"""Limit of the nesting of tables and lists."""
 _LISTS = (list, tuple, np.ndarray)
 _MOST_FILES = 200
-"""Largest number of files of a folder that are examined."""
+"""Limit of the number of files of a folder that are examined."""
 _SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".conf", ".txt", ".calib")
 
 
@@ -63,10 +63,10 @@ _Loader.add_multi_constructor(
 
 
 def read_tree(path: Path) -> Any:
-    """The content of a file.
+    """Parse a file.
 
     Raises:
-        RsbenchError: it cannot be read, or has none of the supported syntaxes.
+        RsbenchError: the file cannot be read, or has none of the supported syntaxes.
     """
     text = read_text(path, _LONGEST)
     try:
@@ -138,7 +138,7 @@ def _number(word: str) -> float | str:
 
 
 def _arrays(tree: Any, depth: int = 0) -> Any:
-    """The tree with arrays in place of matrices."""
+    """Return the tree with each matrix converted to an array."""
     if depth > _DEEPEST:
         raise ValueError(f"nested more than {_DEEPEST} levels deep")
     if isinstance(tree, Mapping):
@@ -154,14 +154,14 @@ def _arrays(tree: Any, depth: int = 0) -> Any:
 
 
 def files_in(folder: Path) -> Iterator[Path]:
-    """Files of a folder, and of folders in it, that may be calibrations."""
+    """Yield the files of a folder and of its subfolders that may be calibrations, by their suffix."""
     inside = sorted(folder.iterdir())
     inside += [each for sub in inside if sub.is_dir() for each in sorted(sub.iterdir())[:_MOST_FILES]]
     yield from [path for path in inside if path.suffix.lower() in _SUFFIXES and path.is_file()][:_MOST_FILES]
 
 
 class Fields:
-    """Typed access to the keys of a table of a file; errors name the file and the key."""
+    """Typed access to the values of a table in a file; errors name the file and the key."""
 
     def __init__(self, tree: Any, where: str) -> None:
         self.where = where
@@ -173,32 +173,32 @@ class Fields:
         return self.tree.get(key) is not None
 
     def known(self, *keys: str) -> str:
-        """The first key that exists; the first of all if none does."""
+        """Return the first key that exists, or the first of ``keys`` if none exists."""
         return next((key for key in keys if key in self), keys[0])
 
     def get(self, *keys: str) -> Any:
-        """Value of the first key that exists; None if none does."""
+        """Return the value of the first key that exists, or None if none exists."""
         return self.tree.get(self.known(*keys))
 
     def inner(self, key: str) -> Fields:
-        """The table under a key."""
+        """Return the table that is the value of a key."""
         return Fields(self.tree.get(key), f"{self.where}: {key}")
 
     def text(self, *keys: str, default: str = "") -> str:
-        """A word, in lower case."""
+        """Return a string in lower case, without blanks at its ends."""
         value = self.get(*keys)
         return default if value is None else str(value).strip().lower()
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A finite number."""
+        """Return a finite number."""
         return default if default is not None and key not in self else float(self.numbers(key, 1)[0])
 
     def each(self, *keys: str) -> list[float]:
-        """A finite number of each key."""
+        """Return a finite number for each key."""
         return [self.number(key) for key in keys]
 
     def numbers(self, key: str, *counts: int) -> FloatArray:
-        """Finite numbers (n,), flattened from nested lists; n must be one of ``counts``, if any are given."""
+        """Return finite numbers (n,), flattened from nested lists; n must be one of ``counts``, if given."""
         value = self.get(key)
         if value is None:
             raise RsbenchError(f"{self.where}: {key}: is missing")
@@ -224,28 +224,28 @@ def _flat(value: Any) -> Iterator[Any]:
 
 Table = dict[str, Any]
 _LONGEST_M = 2.0
-"""Longest baseline, metres, without a given unit; a longer one is taken for another unit than metres."""
+"""Limit of the baseline, metres, if no unit is given; a longer one suggests that the unit is not the metre."""
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 _PROPORTION = 0.005
-"""Largest relative difference of the aspect ratios of scaled images, whose sizes are whole pixels."""
+"""Tolerance of the relative change of the aspect ratio of scaled images, whose sizes are whole pixels."""
 _NEAR = 1e-3
-"""Largest error of R R^T - I of a rotation matrix that was printed with few digits."""
+"""Tolerance of R R^T - I for a rotation matrix that is written with few digits."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Assumptions:
-    """What the user states about a calibration that its file leaves open."""
+    """Assumptions of the user about a calibration that its file does not define."""
 
     unit: float | None = None
     """Metres per unit of the file's lengths."""
     fisheye: bool | None = None
-    """Whether four coefficients are those of a fisheye lens, where the file does not say."""
+    """Whether four coefficients describe a fisheye lens, if the file does not define it."""
     invert: bool = False
-    """Whether the file's transform maps right-camera to left-camera coordinates."""
+    """Whether the transform of the file maps right-camera coordinates to left-camera coordinates."""
     exchange: bool = False
     """Whether the file's second camera is the left one."""
     frame_size: Callable[[], Size] | None = None
-    """(width, height) of the frames, by which some formats choose a section."""
+    """Function that returns (width, height) of the frames; some formats have a section for each size."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,7 +259,7 @@ class Calibration:
     right_from_left: Pose | None = None
     """``X_right = R X_left + t``, metres."""
     right_delay_s: float = 0.0
-    """Seconds by which the right camera reads later than the left one."""
+    """Delay of the right camera relative to the left one, seconds."""
     readout: Table = field(default_factory=dict)
     """Keys of rig.toml above its tables: readout_ratio, scan, right_delay and so on; empty for other formats."""
     notes: tuple[str, ...] = ()
@@ -268,15 +268,15 @@ class Calibration:
 
     @property
     def cameras(self) -> dict[Side, Table]:
-        """Table of each camera."""
+        """Table of each camera, by side."""
         return {"left": self.left} if self.right is None else {"left": self.left, "right": self.right}
 
     def with_tables(self, change: Callable[[Table], Table]) -> Calibration:
-        """The calibration with the tables of its cameras changed alike."""
+        """Return the calibration with a function applied to the table of each camera."""
         return replace(self, **{side: change(table) for side, table in self.cameras.items()})
 
     def tables(self) -> Table:
-        """Tables of rig.toml without the readout."""
+        """Return the tables of rig.toml without readout times."""
         found: Table = {side: _still(table) for side, table in self.cameras.items()}
         if self.right_from_left is not None:
             R, t = self.right_from_left
@@ -299,7 +299,7 @@ class Files(NamedTuple):
         return " and ".join(map(str, self.trees))
 
     def only(self) -> Fields:
-        """The one file."""
+        """Return the table of the only file; RsbenchError if there are several."""
         if len(self.trees) > 1:
             names = ", ".join(path.name for path in self.trees)
             raise RsbenchError(f"{next(iter(self.trees)).parent}: holds several calibrations: {names}; give one")
@@ -313,24 +313,24 @@ class Format(NamedTuple):
     """Whether the content of a file is of this format."""
     read: Callable[[Files], Calibration]
     parts: Callable[[Path, Mapping[Path, Any]], Mapping[Path, Any]] | None = None
-    """Selects the files that belong to a file among all of its format beside it; None if one file is enough."""
+    """Function that selects the files that belong together with a file; None if one file is sufficient."""
 
 
 def table_of(size: Sequence[float] | FloatArray | None, intrinsics: Sequence[float], lens: Lens | None) -> Table:
-    """Camera table of rig.toml from (width, height), (fx, fy, cx, cy) and a lens."""
+    """Return the camera table of rig.toml for (width, height), (fx, fy, cx, cy) and a lens."""
     sizes = {} if size is None else dict(zip(("width", "height"), map(round, size), strict=True))
     numbers = dict(zip(("fx", "fy", "cx", "cy"), map(float, intrinsics), strict=True))
     return {**sizes, **numbers, **({} if lens is None else {"lens": lens.record()})}
 
 
 def camera_of(table: Table, where: str) -> PinholeCamera:
-    """The camera of a table; RsbenchError if its values are impossible."""
+    """Return the camera of a table; RsbenchError if its values are invalid."""
     with naming(where):
         return parse_card(CameraTable, _still(table), where).camera()
 
 
 def lens_of(model: str, coefficients: Iterable[float], where: str) -> Lens | None:
-    """A lens of one of our models; coefficients beyond the model's must be 0."""
+    """Return a lens of one of our models; coefficients that the model does not have must be 0."""
     values = [float(value) for value in coefficients]
     names = COEFFICIENTS[model]  # pyrefly: ignore[bad-index]
     if any(values[len(names) :]):
@@ -343,7 +343,7 @@ def lens_of(model: str, coefficients: Iterable[float], where: str) -> Lens | Non
 
 
 def brown(coefficients: Iterable[float], where: str) -> Lens | None:
-    """OpenCV's vector of 4, 5, 8, 12 or 14 coefficients."""
+    """Return the lens for OpenCV's vector of 4, 5, 8, 12 or 14 coefficients; None if all are 0."""
     values = [*map(float, coefficients)]
     if not any(values):
         return None
@@ -358,7 +358,7 @@ _PROFILES: Mapping[str, Callable[..., Profile]] = {
     "ucm": unified_profile,
     "omni": mirror_profile,
 }
-"""Radial models that we have not."""
+"""Radial profiles of lens models that rsbench does not support; they are approximated."""
 
 
 def camera_table(
@@ -368,9 +368,9 @@ def camera_table(
     coefficients: Sequence[float],
     where: str,
 ) -> tuple[Table, str]:
-    """Camera table, of a lens by the name of its model with us or in other tools.
+    """Return the camera table for a lens model, which has its name in rsbench or in other tools, and a note.
 
-    Of a model that we have not it is the nearest Kannala-Brandt camera, with a note on the error of the fit.
+    For an unsupported model, a Kannala-Brandt lens is fitted, and the note states the error of the fit.
     """
     if name.lower() not in _PROFILES:
         lens = lens_of(name, coefficients, where) if name in COEFFICIENTS else by_name(name, coefficients, where)
@@ -387,7 +387,7 @@ def camera_table(
 
 
 def rotation_of(values: FloatArray, where: str) -> FloatArray:
-    """Rotation matrix (3, 3) from nine numbers, row by row, or from a rotation vector (3,)."""
+    """Return the rotation matrix (3, 3) for nine numbers, row by row, or for a rotation vector (3,)."""
     if len(values) == 3:
         return so3.exp(values)
     R = values.reshape(3, 3)
@@ -398,7 +398,7 @@ def rotation_of(values: FloatArray, where: str) -> FloatArray:
 
 
 def quaternion_of(wxyz: Sequence[float] | FloatArray, where: str) -> FloatArray:
-    """Rotation matrix (3, 3) of a quaternion (w, x, y, z); RsbenchError where its length is not 1 within 1 %."""
+    """Return the rotation matrix of a quaternion (w, x, y, z); RsbenchError if its length is not 1 within 1 %."""
     length = float(np.linalg.norm(wxyz))
     if not abs(length - 1.0) < 1e-2:
         raise RsbenchError(f"{where}: the quaternion has length {length:g}, not 1")
@@ -406,13 +406,13 @@ def quaternion_of(wxyz: Sequence[float] | FloatArray, where: str) -> FloatArray:
 
 
 def pose_of(fields: Fields, key: str) -> Pose:
-    """Transform from the 12 or 16 numbers of a 3 x 4 or 4 x 4 matrix, row by row."""
+    """Return the transform of a 3 x 4 or 4 x 4 matrix, given as 12 or 16 numbers row by row."""
     T = fields.numbers(key, 12, 16).reshape(-1, 4)
     return Pose(rotation_of(T[:3, :3].ravel(), f"{fields.where}: {key}"), T[:3, 3])
 
 
 def in_metres(t: FloatArray, given: Assumptions, where: str) -> tuple[FloatArray, tuple[str, ...]]:
-    """Translation in metres of a file without a unit, and a note on the assumption."""
+    """Convert a translation of unknown unit to metres; also return a note if metres are assumed."""
     length = float(np.linalg.norm(t))
     if given.unit is not None:
         return t * given.unit, ()
@@ -447,7 +447,7 @@ _NAMES = {
 
 
 def by_name(name: str, coefficients: Sequence[float], where: str) -> Lens | None:
-    """Lens from the name of its model in other tools."""
+    """Return a lens for the name of its model in other tools; None if there is no distortion."""
     kind = _NAMES.get(name)
     if kind is None:
         raise RsbenchError(f"{where}: lens model {name!r}: must be one of {', '.join(_NAMES)}")
@@ -457,7 +457,7 @@ def by_name(name: str, coefficients: Sequence[float], where: str) -> Lens | None
 
 
 def unfolded(found: Calibration, given: Assumptions) -> Calibration:
-    """The calibration with monotonic continuations of lens polynomials that fold inside the image."""
+    """Return the calibration with lens polynomials continued monotonically if they fold inside the image."""
     tables, notes = dict[str, Any](), list(found.notes)
     for side, table in found.cameras.items():
         size = _size_of(table) or (None if given.frame_size is None else given.frame_size())
@@ -473,7 +473,7 @@ def _size_of(table: Table) -> Size | None:
 
 
 def _fault(table: Table, size: Size) -> ValueError | None:
-    """Why a camera cannot have images of this size, above all with its lens; None if it can."""
+    """Return the error of a camera of this image size, for example of its lens; None if it is valid."""
     try:
         lens = None if "lens" not in table else Lens(**table["lens"])
         intrinsics = {name: table[name] for name in ("fx", "fy", "cx", "cy")}
@@ -484,7 +484,7 @@ def _fault(table: Table, size: Size) -> ValueError | None:
 
 
 def _continued(table: Table, size: Size) -> tuple[Table, str] | None:
-    """The camera with a continued lens, and a note, if its polynomial folds inside the image; otherwise None."""
+    """Return the camera with a continued lens and a note if its polynomial folds inside the image, else None."""
     if table.get("lens", {}).get("model") not in ("brown-conrady", "rational"):
         return None
     fx, fy, cx, cy = (table[key] for key in ("fx", "fy", "cx", "cy"))
@@ -504,7 +504,7 @@ def _continued(table: Table, size: Size) -> tuple[Table, str] | None:
 
 
 def refuse_unseen(found: Calibration, where: object) -> None:
-    """Raises RsbenchError, with a crop that helps, where corners of an image show no ray before the camera."""
+    """Raise RsbenchError, which suggests a crop, if image corners have no ray in front of the camera."""
     sizes = [size for table in found.cameras.values() if (size := _size_of(table)) is not None]
     for side, table in found.cameras.items():
         size = _size_of(table)
@@ -524,12 +524,12 @@ def refuse_unseen(found: Calibration, where: object) -> None:
 
 
 def _cut(table: Table, x: int, y: int) -> Table:
-    """The camera of images without their first x columns and y rows."""
+    """Return the camera of images from which the first x columns and y rows are removed."""
     return table | {"cx": table["cx"] - x, "cy": table["cy"] - y}
 
 
 def cropped(found: Calibration, crop: str) -> Calibration:
-    """The calibration of frames that are cropped to WxH+X+Y; RsbenchError where that is not inside them."""
+    """Return the calibration of frames cropped to WxH+X+Y; RsbenchError if the crop exceeds the images."""
     numbers = re.fullmatch(r"(\d{1,6})x(\d{1,6})\+(\d{1,6})\+(\d{1,6})", crop)
     if numbers is None:
         raise RsbenchError(f"--crop {crop!r}: must be WIDTHxHEIGHT+X+Y, such as 640x480+104+160")
@@ -546,10 +546,10 @@ def cropped(found: Calibration, crop: str) -> Calibration:
 
 
 def with_size(found: Calibration, size: Size) -> Calibration:
-    """The calibration with this image size where it has none.
+    """Return the calibration with this image size if it has none.
 
     Raises:
-        RsbenchError: it has another size.
+        RsbenchError: the calibration has another image size.
     """
 
     def sized(table: Table) -> Table:
@@ -565,7 +565,7 @@ def with_size(found: Calibration, size: Size) -> Calibration:
 
 
 def resized(found: Calibration, size: Size) -> Calibration:
-    """The calibration of the same images scaled to another size; RsbenchError where the proportions differ."""
+    """Return the calibration of images scaled to another size; RsbenchError if the aspect ratio differs."""
 
     def scaled(table: Table) -> Table:
         if "width" not in table:

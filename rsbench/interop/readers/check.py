@@ -1,7 +1,7 @@
 """Consistency checks of a recording: files, sizes, depth against poses, disparities, and matches in the images.
 
-For the images, a few pairs are matched, of the two cameras at one time and of one camera at successive times:
-matches must lie on epipolar lines, and points at their pixels. A lens, extrinsic or pose with the wrong
+A few image pairs are matched, of both cameras at the same time and of one camera at successive times. Matches must
+lie on epipolar lines, and given 3D points must project to their pixels. A lens, extrinsic or pose in the wrong
 convention moves the lines by far more than the error of features.
 """
 
@@ -29,11 +29,11 @@ from rsbench.pipeline.footage import read_frame
 from rsbench.vision.features import Features, Gate, detect, match
 
 _ROWS = 30
-"""Iterations to find the row that sees a point; each multiplies the error by readout ratio times speed."""
+"""Iterations to find the row that sees a point; each multiplies the error by readout ratio times image speed."""
 _TOLERANCE = 0.01
-"""Largest relative difference of equal depths: text has four decimals, and depth is interpolated."""
+"""Tolerance of the relative depth difference: depth is interpolated, and text has four decimals."""
 _TYPICAL = 2e-3
-"""Largest median of the relative differences: wrong poses, times or kinds of depth leave more."""
+"""Threshold of the median relative difference; wrong poses, times or depth conventions exceed it."""
 _SHARE = 0.8
 _LEAST_DISPARITY_SHARE = 0.9
 
@@ -63,7 +63,7 @@ class Agreement:
 
 
 def file_faults(recording: Recording, progress: Callable[[str], object] = str) -> Iterator[str]:
-    """Images that are missing, unreadable or of another size than their camera; ``progress`` gets each name."""
+    """Yield a fault for each image that is unreadable or differs from its camera's size; calls ``progress``."""
     for path, side in (
         *((path, side) for (side, _), path in recording.images.items()),
         *((path, side) for (side, *_), path in (*recording.truths.items(), *recording.masks.items())),
@@ -80,7 +80,7 @@ def file_faults(recording: Recording, progress: Callable[[str], object] = str) -
 
 
 def disparity_faults(recording: Recording) -> Iterator[str]:
-    """Disparities of another size, or that point outside the other image."""
+    """Yield a fault for each disparity map of another size, or whose pixels map outside the other image."""
     for (side, frame), read in recording.disparities.items():
         found, camera = read(), recording.cameras[side]
         if found.shape != (camera.height, camera.width):
@@ -123,7 +123,7 @@ def _agreement(recording: Recording, side: Side, first: int, second: int) -> Agr
     difference = (there - points[inside, 2]) / points[inside, 2]
     difference = difference[
         np.isfinite(difference) & (difference > -10.0 * _TOLERANCE)
-    ]  # leaves out points hidden by nearer surfaces
+    ]  # excludes occluded points
     sizes = np.abs(difference)
     return Agreement(
         side=side,
@@ -135,7 +135,7 @@ def _agreement(recording: Recording, side: Side, first: int, second: int) -> Agr
 
 
 def _sampled(depth: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Depth (n,) at pixels (n, 2), by interpolating its inverse (exact on planes); NaN beside unknown depth."""
+    """Interpolate depth (n,) at pixels (n, 2) in 1 / z, which is exact for planes; NaN next to unknown depth."""
     with np.errstate(divide="ignore"):
         near = np.where(depth > 0.0, 1.0 / depth, np.nan)
     where = pixels.astype(np.float32)[None]
@@ -146,21 +146,21 @@ def _sampled(depth: FloatArray, pixels: FloatArray) -> FloatArray:
 
 Value = TypeVar("Value")
 NEAR_PX = 3.0
-"""Distance from line or pixel within which a match or a point agrees; features are accurate to one pixel."""
+"""Tolerance, px, of the distance from the line or pixel; features are accurate to one pixel."""
 LOOKS = 4
-"""Most pairs of each kind, and most images whose points are projected; spread over the recording."""
+"""Largest number of checked pairs of each kind, and of images with given points; spread over the recording."""
 _FEWEST = 30
 _SIGHT_SHARE = 0.5
-"""Least share of matches or points that agree; a quarter of all matches may be wrong."""
+"""Threshold of the share of matches or points that agree; a quarter of all matches may be wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sight:
-    """Agreement of matches or points in images with cameras and poses."""
+    """Agreement of matches or given points in images with cameras and poses."""
 
     what: str
     count: int
-    """Matches or points."""
+    """Number of matches or points."""
     share: float
     """Share of these within ``NEAR_PX``."""
     typical: float
@@ -179,7 +179,7 @@ class Sight:
 
 
 def sights(recording: Recording) -> Iterator[Sight]:
-    """Compare pairs of images whose poses are known, and the observed points of the layout."""
+    """Check matches of image pairs with known poses, and the projections of given points."""
     for (side, frame), read in _spread(list(recording.sightings.items())):
         pixels, points = read()
         landed = recording.cameras[side].project(transform(_camera_pose(recording, side, frame, pixels), points))
@@ -187,7 +187,7 @@ def sights(recording: Recording) -> Iterator[Sight]:
     for a, b in _pairs(recording):
         try:
             pixels = _matches(recording.images[a], recording.images[b])
-        except RsbenchError:  # reported by the check of files
+        except RsbenchError:  # reported by ``file_faults``
             continue
         found = _relative(recording, a, b, pixels)
         if found is not None:
@@ -198,10 +198,10 @@ def sights(recording: Recording) -> Iterator[Sight]:
 def epipolar_distance(
     b_from_a: Pose, pixels: FloatArray, camera_a: PinholeCamera, camera_b: PinholeCamera
 ) -> FloatArray:
-    """Distance (n,) of matches (n, 4), x, y in a and in b, from epipolar half-lines, px of images without lenses.
+    """Return distances (n,) of matches (n, 4), x, y in a and b, from epipolar half-lines, undistorted px.
 
-    Points in front of both cameras lie on a half-line: the distance is Sampson's from the line, or for a match on
-    its other half that from its end, where points at infinity are seen.
+    Points in front of both cameras project to a half-line that begins at the point at infinity. The distance is
+    the Sampson distance from the line, or at least that from this end if the match lies on the other half.
     """
     x0, x1 = camera_a.unproject(pixels[:, :2]), camera_b.unproject(pixels[:, 2:])
     E = essential_matrix(b_from_a)
@@ -212,7 +212,7 @@ def epipolar_distance(
     turned = (b_from_a.R @ x0[..., None])[..., 0]
     across = so3.cross(x1, turned)
     behind = np.sum(across * so3.cross(x1, np.broadcast_to(b_from_a.t, x1.shape)), axis=-1) > 0.0
-    with np.errstate(invalid="ignore", divide="ignore"):  # no motion: no line
+    with np.errstate(invalid="ignore", divide="ignore"):  # without a translation there is no line
         off = value / np.linalg.norm(np.concatenate(lines, axis=-1), axis=-1)
         from_end = np.linalg.norm((x1 - turned / turned[:, 2:])[:, :2] * focal_b, axis=-1)
     return np.where(behind, np.maximum(off, from_end), off)
@@ -227,7 +227,7 @@ def _sight(what: str, distances: FloatArray) -> Sight:
 
 
 def _pairs(recording: Recording) -> Iterator[tuple[View, View]]:
-    """Images to match: of the two cameras, and of successive times where times are known."""
+    """Yield image pairs to match: of both cameras, and of successive frames if the frame period is known."""
     known = recording.images
     across = [k for side, k in known if side == "left" and ("right", k) in known]
     for k in _spread(across):
@@ -238,13 +238,13 @@ def _pairs(recording: Recording) -> Iterator[tuple[View, View]]:
 
 
 def _spread(values: list[Value]) -> list[Value]:
-    """At most ``LOOKS`` of the values, including the first and the last."""
+    """Select at most ``LOOKS`` of the values, evenly, including the first and the last."""
     chosen = np.unique(np.linspace(0, len(values) - 1, min(LOOKS, len(values))).astype(int))
     return [values[k] for k in chosen]
 
 
 def _relative(recording: Recording, a: View, b: View, pixels: FloatArray) -> Pose | None:
-    """``b_from_a`` of matches, at the times of their rows; None where it is not known."""
+    """Return ``b_from_a`` of matches at the times of their rows; None if it is unknown."""
     if {a[0], b[0]} <= recording.poses.keys():
         found = compose(
             _camera_pose(recording, *b, pixels[:, 2:]), inverse(_camera_pose(recording, *a, pixels[:, :2]))
@@ -255,14 +255,14 @@ def _relative(recording: Recording, a: View, b: View, pixels: FloatArray) -> Pos
 
 
 def _camera_pose(recording: Recording, side: Side, frame: int, pixels: FloatArray) -> Pose:
-    """Poses of a camera at the times of pixels (n, 2); one pose where the shutter is not known."""
+    """Return the poses of a camera at the times of pixels (n, 2); the frame's pose if the shutter is unknown."""
     shutter = recording.shutters.get(side)
     tau = np.full(len(pixels), float(frame)) if shutter is None else shutter.pixel_time(pixels, frame, side)
     return recording.poses[side](tau)
 
 
 def _matches(a: Path, b: Path) -> FloatArray:
-    """(n, 4) x, y in a and in b."""
+    """Match two images; return (n, 4) x, y in a and in b."""
     one, two = _features(a), _features(b)
     pairs = match(one, two, Gate(dx=(-np.inf, np.inf), dy=(-np.inf, np.inf)))
     return np.concatenate([one.points[pairs[:, 0]], two.points[pairs[:, 1]]], axis=1)

@@ -1,9 +1,9 @@
 """Readers of gyroscope logs: gyroflow's text format ``.gcsv``, and the ``.csv`` of the channel ``imu``.
 
-``.gcsv`` (docs.gyroflow.xyz, GCSV format): a line GYROFLOW IMU LOG or CAMERA IMU LOG, lines ``key,value``, the
-names of the columns from ``t`` on, numbers. ``tscale`` and ``gscale`` convert them to seconds and rad/s;
-``orientation`` gives the column and the sign (lower case: minus) of each of gyroflow's axes: x up, y left, z
-backwards.
+``.gcsv`` (docs.gyroflow.xyz, GCSV format): a line GYROFLOW IMU LOG or CAMERA IMU LOG, lines ``key,value``, a line
+of column names that begins with ``t``, and lines of numbers. ``tscale`` and ``gscale`` convert them to seconds and
+rad/s; ``orientation`` gives the column and the sign (lower case: minus) of each of gyroflow's axes: x up, y left,
+z backwards.
 """
 
 from __future__ import annotations
@@ -30,25 +30,26 @@ class GyroLog(NamedTuple):
     """Measurements of a gyroscope, in the order of time."""
 
     times_s: FloatArray
-    """(n,) seconds of the log's own clock, increasing."""
+    """(n,) times of the log's own clock, s, increasing."""
     rates: FloatArray
-    """(n, 3) rad/s, in the axes of the camera: x right, y down, z forward."""
+    """(n, 3) angular velocities, rad/s, in the camera axes: x right, y down, z forward."""
 
     def samples(self, fps: float, offset_s: float) -> FloatArray:
-        """(n, 4) tau, w of ``Correspondences.gyro``, tau 0 the first row of the first frame.
+        """Return samples (n, 4), tau and w, for ``Correspondences.gyro``; tau = 0 at the first row of frame 0.
 
         Args:
             fps: frames per second.
-            offset_s: time of the log's clock at tau 0.
+            offset_s: time of the log's clock at tau = 0.
         """
         return np.column_stack([(self.times_s - offset_s) * fps, -self.rates / fps])
 
 
 def read_gyro_log(path: Path) -> GyroLog:
-    """Read a log, whose format is known by its suffix.
+    """Read a log; the suffix determines its format.
 
     Raises:
-        RsbenchError: missing, another suffix, malformed, times that do not increase, or fewer than two samples.
+        RsbenchError: the file is missing or malformed, has another suffix, decreasing times, or fewer than two
+            samples of different times.
     """
     suffix = path.suffix.lower()
     if suffix not in (".gcsv", ".csv"):
@@ -78,7 +79,7 @@ def _of_csv(text: Sequence[str], path: Path) -> tuple[list[int], FloatArray, Flo
 
 
 def _of_gcsv(text: Sequence[str], path: Path) -> tuple[list[int], FloatArray, FloatArray]:
-    """Defaults of absent keys are those of gyroflow: milliseconds, scale 1, xzY, columns 1 to 3."""
+    """Read gyroflow's format; absent keys have gyroflow's defaults: milliseconds, scale 1, xzY, columns 1 to 3."""
     start = next((k for k, line in enumerate(text) if _cells(line)[0] in ("t", "time")), None)
     if not text or not text[0].strip().startswith(_TITLES) or start is None:
         raise RsbenchError(f"{path}: must begin with {_TITLES[0]} and have a line t,gx,gy,gz")
@@ -111,7 +112,7 @@ def _cells(line: str) -> list[str]:
 
 
 def _table(text: Sequence[str], start: int, columns: Sequence[int], path: Path) -> tuple[list[int], FloatArray]:
-    """Line numbers (n) and values (n, k) of some columns below the line ``start``, of lines that have all of them.
+    """Read line numbers (n,) and values (n, k) of columns below line ``start``, from lines that have all of them.
 
     A missed reading leaves a cell empty, and an interrupted log ends with an incomplete line.
     """
@@ -129,7 +130,7 @@ def _table(text: Sequence[str], start: int, columns: Sequence[int], path: Path) 
 
 
 def _unrolled(ticks: FloatArray) -> FloatArray:
-    """Continuous times of a counter that overflows after 2^16, 2^24 or 2^32 ticks.
+    """Return continuous times for a counter that overflows after 2^16, 2^24 or 2^32 ticks.
 
     A negative step is an overflow if the corrected step is at most ten times the median step; others stay.
     """

@@ -1,17 +1,17 @@
-"""Readers of datasets in the layouts of other projects; what a layout does not contain stays absent.
+"""Readers of datasets in the layouts of other projects; data that a layout lacks are absent in the result.
 
 **COLMAP**'s text model: cameras.txt, images.txt and, where they exist, points3D.txt, rigs.txt and frames.txt (of
-COLMAP 3.12: ``sensor_from_rig`` of each camera, and the images of one time). Its pixel origin is the corner of
-the image, ours the centre of the first pixel: half a pixel less. A quaternion is (w, x, y, z), and
-a pose ``cam_from_world``, as ours. The layout has no times: images are ordered by name, with one pose each and no
-shutter. A rig of two cameras becomes one recording, and so does each other camera.
+COLMAP 3.12: ``sensor_from_rig`` of each camera, and the images of each frame). Its pixel origin is the corner of
+the image, ours the centre of the first pixel, so 0.5 px are subtracted. Quaternions are (w, x, y, z); poses are
+``cam_from_world``, as ours. The layout has no times: images are ordered by name, with one pose each and no
+shutter. A rig of two cameras becomes one recording, and every other camera becomes one of its own.
 
-**EuRoC**, TUM VI and TUM RS-VI (the ASL layout): ``mav0/cam0/sensor.yaml`` holds ``T_BS``, which takes the
-sensor's coordinates to the body's (where it is absent, a camchain of Kalibr nearby has them), ``data.csv`` times
-in nanoseconds and file names; poses are those of the body, p and q = (w, x, y, z), in ``mocap0`` or
-``state_groundtruth_estimate0``. Times are whole numbers: as floats they would lose 256 ns. The layout does not
-describe a rolling shutter: TUM RS-VI's line delay (29.4737 us of camera 1; camera 0 is global) is published beside
-it, and its times are assumed to be those of the first row.
+**EuRoC**, TUM VI and TUM RS-VI (the ASL layout): ``mav0/cam0/sensor.yaml`` has ``T_BS``, which maps sensor
+coordinates to body coordinates (if it is absent, a camchain of Kalibr is used); ``data.csv`` has times in
+nanoseconds and file names. Body poses, p and q = (w, x, y, z), are in ``mocap0`` or
+``state_groundtruth_estimate0``. Times are read as integers, because float64 rounds them to 256 ns. The layout does
+not describe a rolling shutter: TUM RS-VI's line delay (29.4737 us for camera 1; camera 0 has a global shutter) is
+published separately, and its times are assumed to be those of the first row.
 
 **Carla-RS** (Liu et al., Deep Shutter Unrolling Network, CVPR 2020): a sequence is a folder with ``gt_vel.log``
 (wx, wy, wz in rad/s and x, y, z per second), ``%04d_rs.png``, and where depth was rendered ``%04d_rs.depth`` or
@@ -90,7 +90,7 @@ from rsbench.storage.untrusted_files import NUMBER, inside, read_bytes, read_tex
 
 
 def numbers(text: str, where: object, count: int | None = None) -> FloatArray:
-    """(n,) finite numbers, separated by blanks or commas; RsbenchError for anything else or another count."""
+    """Parse (n,) finite numbers separated by blanks or commas; RsbenchError if invalid or n is not ``count``."""
     words = text.replace(",", " ").split()
     try:
         values = np.array([float(word) for word in words])
@@ -103,14 +103,14 @@ def numbers(text: str, where: object, count: int | None = None) -> FloatArray:
 
 
 def lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Lines that are neither empty nor comments (#), each with file and line number."""
+    """Yield the lines that are neither empty nor comments (#), each after its file and line number."""
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield f"{path}:{number}", line
 
 
 def only_file(folder: Path, *names: str) -> Path:
-    """The first of some files that exists; RsbenchError if none does."""
+    """Return the first of the named files that exists; RsbenchError if none exists."""
     for name in names:
         if (folder / name).is_file():
             return folder / name
@@ -118,7 +118,7 @@ def only_file(folder: Path, *names: str) -> Path:
 
 
 def _pinhole(size: Sequence[float], K: FloatArray, where: object, lens: Lens | None = None) -> PinholeCamera:
-    """A camera from (width, height), a calibration matrix (3, 3 or more) and a lens."""
+    """Return a camera for (width, height), a calibration matrix (3, 3 or more) and a lens."""
     return camera_of(table_of(size, K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), lens), str(where))
 
 
@@ -129,13 +129,13 @@ def _nanoseconds(stamp: str, where: str) -> int:
 
 
 def _fields_of(path: Path, separator: str) -> Fields:
-    """The words after each key of a file; brackets and semicolons of matrices count as blanks."""
+    """Return the words after each key of a file; brackets and semicolons of matrices count as blanks."""
     pairs = (line.partition(separator) for _, line in lines(path))
     return Fields({key.strip(): re.sub(r"[\[\];]", " ", value).split() for key, _, value in pairs}, str(path))
 
 
 def _holders(folder: Path, pattern: str, wanted: str) -> list[Path]:
-    """Folders below a folder, or itself, with a file of this name; RsbenchError, what was wanted, without one."""
+    """Return the folder and subfolders that contain a file of this name; RsbenchError if there are none."""
     found = sorted({path.parent for path in folder.rglob(pattern)})
     if not found:
         raise RsbenchError(f"{folder}: holds no {wanted}")
@@ -143,13 +143,13 @@ def _holders(folder: Path, pattern: str, wanted: str) -> list[Path]:
 
 
 def _numbered_images(folder: Path, digits: int, kind: str) -> dict[View, Path]:
-    """Image files of one kind by left frame, whose number has so many digits."""
+    """Return the image files of one kind by view, from file names with a frame number of ``digits`` digits."""
     found = sorted(folder.glob(f"{'[0-9]' * digits}_{kind}.*"))
     return {("left", int(path.name[:digits])): path for path in found if path.suffix in (".png", ".jpg")}
 
 
 def _numbered_truths(folder: Path, digits: int, rows: Mapping[str, int]) -> dict[tuple[Side, int, int], Path]:
-    """Global-shutter images of each kind, with the row at whose time they were taken."""
+    """Return the global-shutter images of each kind, with the row at whose time they were taken."""
     found = {kind: _numbered_images(folder, digits, kind) for kind in rows}
     return {(*view, rows[kind]): path for kind, images in found.items() for view, path in images.items()}
 
@@ -204,7 +204,7 @@ def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
 
 
 class _ColmapRig(NamedTuple):
-    """A rig of two cameras: its number, the cameras' numbers, how they stand, and the images of each time."""
+    """A rig of two cameras: its number, the cameras' numbers, their relative pose, and the images by frame."""
 
     number: str
     sides: dict[Side, str]
@@ -213,7 +213,7 @@ class _ColmapRig(NamedTuple):
 
 
 def _colmap_rigs(folder: Path, cameras: Mapping[str, PinholeCamera]) -> list[_ColmapRig]:
-    """The rigs of rigs.txt that have two cameras, of which each has a pose; none without the file."""
+    """Return the rigs of rigs.txt that have two cameras with poses; none if the file does not exist."""
     path, found = folder / "rigs.txt", list[_ColmapRig]()
     for where, line in lines(path) if path.is_file() else ():
         words = line.split()
@@ -228,15 +228,15 @@ def _colmap_rigs(folder: Path, cameras: Mapping[str, PinholeCamera]) -> list[_Co
 
 
 def _left_first(cameras: tuple[str, str], second_from_first: Pose) -> tuple[dict[Side, str], Pose]:
-    """Which of two cameras is the left one, by where the second one stands in the first, and right_from_left."""
+    """Determine the left one of two cameras from their relative pose; return the sides and right_from_left."""
     x, y, _ = inverse(second_from_first).t
-    if (x if abs(x) >= abs(y) else y) < 0.0:  # one above the other: the upper one counts as the left one
+    if (x if abs(x) >= abs(y) else y) < 0.0:  # in a vertical rig the upper camera is the left one
         return dict(zip(SIDES, cameras[::-1], strict=True)), inverse(second_from_first)
     return dict(zip(SIDES, cameras, strict=True)), second_from_first
 
 
 def _colmap_times(folder: Path, rig: str) -> list[list[str]]:
-    """Image numbers of each frame of a rig, from frames.txt."""
+    """Return the image numbers of each frame of a rig, from frames.txt."""
     found, path = list[list[str]](), only_file(folder, "frames.txt")
     for where, line in lines(path):
         words = line.split()
@@ -257,7 +257,7 @@ def _colmap_camera(where: str, line: str) -> tuple[str, PinholeCamera]:
 
 
 def _colmap_image_lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Line of each image with the line of its points, which is empty or, in some files, absent without points."""
+    """Yield the line of each image and the line of its points, which may be empty or absent without points."""
     image = ""
     for line in read_text(path).splitlines():
         if line.lstrip().startswith("#"):
@@ -272,7 +272,7 @@ def _colmap_image_lines(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _colmap_image(where: str, line: str) -> tuple[str, str, str, Pose]:
-    """Number, name, camera and pose."""
+    """Parse the number, name, camera and pose of an image."""
     words = line.split(maxsplit=9)
     if len(words) != 10:
         raise RsbenchError(f"{where}: must be a number, a quaternion, a translation, a camera and a name")
@@ -281,7 +281,7 @@ def _colmap_image(where: str, line: str) -> tuple[str, str, str, Pose]:
 
 
 def _colmap_points_seen(points: Path, line: str, where: str) -> tuple[FloatArray, FloatArray]:
-    """Pixels and 3D points from a line of x, y, point number triples; -1 is a pixel without a point."""
+    """Return pixels and 3D points from a line of triples (x, y, point number); -1 is a pixel without a point."""
     known, values = _colmap_points(points), numbers(line, where)
     if len(values) % 3:
         raise RsbenchError(f"{where}: its points must be x, y and a number each")
@@ -292,7 +292,7 @@ def _colmap_points_seen(points: Path, line: str, where: str) -> tuple[FloatArray
 
 @lru_cache(maxsize=2)
 def _colmap_points(path: Path) -> dict[int, FloatArray]:
-    """Positions of points by number."""
+    """Return the positions of the 3D points by their number."""
     found = {}
     for where, line in lines(path):
         number, *place = numbers(" ".join(line.split()[:4]), where, 4)
@@ -308,7 +308,7 @@ def _colmap_recording(
     root: Path,
     right_from_left: Pose | None,
 ) -> Recording:
-    """A recording of one camera or two, from the images of each time by camera, in any order."""
+    """Return a recording of one or two cameras, from the images of each time, by camera, in any order."""
     times = sorted(times, key=lambda together: next(together[c].name for c in sides.values() if c in together))
     shots = {
         (side, k): together[camera]
@@ -329,7 +329,7 @@ def _colmap_recording(
 
 
 def _pose_of_image(known: Mapping[int, Pose], tau: FloatArray) -> Pose:
-    """Pose of the image whose number is ``tau``; NaN between whole numbers."""
+    """Return the pose of the image with the index ``tau``; NaN if ``tau`` is not an integer."""
     tau = np.asarray(tau, dtype=np.float64)
     R, t = np.full((*tau.shape, 3, 3), np.nan), np.full((*tau.shape, 3), np.nan)
     for number, pose in known.items():
@@ -341,7 +341,7 @@ _EUROC_POSES = ("state_groundtruth_estimate0", "mocap0", "gt0")
 
 
 def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) -> list[Recording]:
-    """The sequence of a folder that is or contains ``mav0``, or contains the cameras.
+    """Read the sequence of a folder that is or contains ``mav0``, or contains the cameras.
 
     Args:
         line_delays_s: seconds between rows, 0 for a global shutter; if None, from the calibration.
@@ -384,7 +384,7 @@ def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) 
 
 
 def _asl_cameras(root: Path, sensors: Mapping[Side, Path]) -> dict[Side, tuple[Table, Pose]]:
-    """Table and ``body_from_camera`` of each camera, from sensor.yaml or a camchain of Kalibr.
+    """Return the table and ``body_from_camera`` of each camera, from sensor.yaml or a camchain of Kalibr.
 
     TUM VI and TUM RS-VI are distributed with ``dso/camchain.yaml`` in place of the first.
     """
@@ -400,15 +400,15 @@ def _asl_cameras(root: Path, sensors: Mapping[Side, Path]) -> dict[Side, tuple[T
 
 
 def _line_delays(known: Mapping[Side, tuple[Table, Pose]]) -> dict[Side, float]:
-    """Seconds between rows of each camera; empty unless all cameras have them."""
+    """Return the time between rows of each camera, seconds; empty unless it is known for all cameras."""
     found = {side: table["line_delay_s"] for side, (table, _) in known.items() if "line_delay_s" in table}
     return found if len(found) == len(known) else {}
 
 
 def _together(times: Mapping[Side, Mapping[int, Path]], height: int) -> list[dict[Side, int]]:
-    """Time stamps of simultaneous images: those nearest to the left camera's, within half a row.
+    """Match each left image to the images of other cameras with the nearest time stamp, within half a row.
 
-    Cameras with clocks of their own, or stamps that went through floats, differ by some nanoseconds.
+    Time stamps of simultaneous images may differ by some nanoseconds, by separate clocks or rounding to floats.
     """
     left = np.array(sorted(times["left"]), dtype=np.int64)
     most = np.median(np.diff(left)) / height / 2.0 if len(left) > 1 else 0.0
@@ -422,7 +422,7 @@ def _together(times: Mapping[Side, Mapping[int, Path]], height: int) -> list[dic
 
 
 def _euroc_times(folder: Path) -> dict[int, Path]:
-    """Image files by time stamp, nanoseconds."""
+    """Return the image files by time stamp, nanoseconds."""
     out = {}
     for where, line in lines(folder / "data.csv"):
         stamp, _, name = line.partition(",")
@@ -431,7 +431,7 @@ def _euroc_times(folder: Path) -> dict[int, Path]:
 
 
 def _trajectory(root: Path, start_ns: int, period_s: float) -> PoseAt | None:
-    """``world_from_body`` by time in frame periods; None without a file of poses."""
+    """Return a function from time, frame periods, to ``world_from_body``; None without a file of poses."""
     path = next((root / name / "data.csv" for name in _EUROC_POSES if (root / name / "data.csv").is_file()), None)
     if path is None:
         return None
@@ -451,7 +451,7 @@ def _trajectory(root: Path, start_ns: int, period_s: float) -> PoseAt | None:
 
 
 def _between(known: FloatArray, turns: Slerp, places: FloatArray, tau: FloatArray) -> Pose:
-    """Interpolate poses: position linear, rotation at constant speed; NaN outside the known times."""
+    """Interpolate poses: positions linearly, rotations at constant angular velocity; NaN outside given times."""
     tau = np.asarray(tau, dtype=np.float64)
     clipped = np.clip(tau, known[0], known[-1])
     R = turns(clipped.ravel()).as_matrix().reshape(*tau.shape, 3, 3)
@@ -478,10 +478,10 @@ _CARLA_FPS = 20.0
 
 
 def read_carla(folder: Path) -> list[Recording]:
-    """Every sequence below a folder, or the folder itself.
+    """Read the sequences in a folder and its subfolders.
 
     Raises:
-        RsbenchError: no gt_vel.log, or a malformed file.
+        RsbenchError: there is no gt_vel.log, or a file is malformed.
     """
     found = _holders(folder, "gt_vel.log", "gt_vel.log, as sequences of Carla-RS do")
     return [_read_carla_sequence(each) for each in found]
@@ -518,13 +518,13 @@ def _read_carla_sequence(folder: Path) -> Recording:
 
 
 def _carla_pose(w: FloatArray, v: FloatArray, tau: FloatArray) -> Pose:
-    """``cam_from_world`` at times (...), velocities per frame period."""
+    """Return ``cam_from_world`` at times (...), frame periods, for velocities per frame period."""
     tau = np.asarray(tau, dtype=np.float64)[..., None]
     return inverse(Pose(so3.exp(tau * w), tau * v))
 
 
 def _carla_timing(folder: Path, height: int) -> tuple[float, float, bool]:
-    """Frames per second, seconds per row, and whether they are from rs_calib.txt, here or one folder up."""
+    """Return frames per second, seconds per row, and whether rs_calib.txt, here or one folder up, defines them."""
     for path in (folder / "rs_calib.txt", folder.parent / "rs_calib.txt"):
         if path.is_file():
             fields = _fields_of(path, ":")
@@ -555,10 +555,10 @@ def _read_carla_depth(path: Path, camera: PinholeCamera, radial: bool) -> FloatA
 
 
 def read_fastec(folder: Path) -> list[Recording]:
-    """Every sequence below a folder, or the folder itself.
+    """Read the sequences in a folder and its subfolders.
 
     Raises:
-        RsbenchError: no frame, or the first one of a sequence is not an image.
+        RsbenchError: there is no frame, or the first frame of a sequence is not an image.
     """
     wanted = "000_rolling.png, as sequences of Fastec-RS do"
     places = _holders(folder, "[0-9][0-9][0-9]_rolling.png", wanted)
@@ -585,7 +585,7 @@ _MM = 1e-3
 
 
 def read_middlebury(folder: Path) -> list[Recording]:
-    """Every scene below a folder, or the folder itself; RsbenchError if there is none or a file is malformed."""
+    """Read the scenes in a folder and its subfolders; RsbenchError if there are none or a file is malformed."""
     found = sorted(path.parent for path in folder.glob("**/calib.txt") if (path.parent / "im0.png").is_file())
     if not found:
         raise RsbenchError(f"{folder}: holds no scene of Middlebury: no calib.txt beside an im0.png")
@@ -619,7 +619,7 @@ def _apart(baseline: float) -> Pose:
 
 
 def _middlebury_disparities(path: Path, offset: float) -> FloatArray:
-    """Disparities (H, W) of a grey PFM, plus the offset of the principal points; NaN where unknown."""
+    """Read disparities (H, W) from a grey PFM and add the offset of the principal points; NaN where unknown."""
     data = read_bytes(path)
     found = re.match(rb"Pf\s+(\d+)\s+(\d+)\s+(-?[0-9.eE+]+)\s", data)
     if found is None:
@@ -634,7 +634,7 @@ def _middlebury_disparities(path: Path, offset: float) -> FloatArray:
 
 
 def read_kitti(folder: Path) -> list[Recording]:
-    """Every pair that has disparities, and the images of the next time where they exist."""
+    """Read each pair ``*_10.png``, with its disparities and the images of the next time if they exist."""
     pairs = (("image_2", "image_3"), ("image_0", "image_1"))
     images = next((names for names in pairs if all((folder / name).is_dir() for name in names)), None)
     if images is None:
@@ -680,7 +680,7 @@ def _kitti_disparities(path: Path, size: tuple[int, int], offset: float) -> Floa
 
 
 def read_kitti_raw(folder: Path) -> list[Recording]:
-    """Each drive below a folder, or the drive itself; RsbenchError if there is none or a file is malformed."""
+    """Read the drives in a folder, or a single drive; RsbenchError if there are none or a file is malformed."""
     found = sorted(path.parent for pair in _KITTI_PAIRS for path in folder.glob(f"**/{pair[0]}") if path.is_dir())
     if not found:
         raise RsbenchError(f"{folder}: holds no drive of KITTI: no folders image_02 and image_03, or 00 and 01")
@@ -718,7 +718,7 @@ def _kitti_drive(drive: Path) -> Recording:
 
 
 def _kitti_camera(fields: Fields, number: str, size: tuple[int, int]) -> tuple[PinholeCamera, Pose]:
-    """Camera ``number`` of calib_cam_to_cam.txt for images of this size, and its pose from camera 0."""
+    """Return camera ``number`` of calib_cam_to_cam.txt for images of this size, and its pose from camera 0."""
     raw, rectified = (tuple(map(int, fields.numbers(f"{key}_{number}", 2))) for key in ("S", "S_rect"))
     if size == raw:
         K, d, R, t = (fields.numbers(f"{key}_{number}", n) for key, n in (("K", 9), ("D", 5), ("R", 9), ("T", 3)))
@@ -734,7 +734,7 @@ def _kitti_camera(fields: Fields, number: str, size: tuple[int, int]) -> tuple[P
 
 
 def _kitti_period(path: Path) -> float:
-    """Median time between frames, s, of a file with a date and a time in each line."""
+    """Return the median time between frames, s, from a file with a date and a time in each line."""
     days = [line.split() for _, line in lines(path)]
     try:
         seconds = [60 * (60 * int(h) + int(m)) + float(s) for _, time in days for h, m, s in [time.split(":")]]
@@ -762,10 +762,10 @@ FORMATS: Mapping[str, Callable[[Path], list[Recording]]] = {
 
 
 def read_others(folder: Path, format_name: str) -> list[Recording]:
-    """The recordings of a folder.
+    """Read the recordings of a folder.
 
     Raises:
-        RsbenchError: unknown layout, or the folder does not have it.
+        RsbenchError: the layout is unknown, or the folder does not have it.
     """
     if format_name not in FORMATS:
         raise RsbenchError(f"--from {format_name}: is not a layout{choices(format_name, FORMATS)}")

@@ -39,7 +39,7 @@ class Readout:
             raise RsbenchError(f"--fps {self.fps:g}: must be a positive number of frames per second")
 
     def into(self, table: Mapping[str, Any]) -> Table:
-        """The tables of a rig or camera with these values in place of theirs."""
+        """Return the tables of a rig or camera with their readout values replaced by these."""
         made = dict(table)
         if self.readout_ratio is not None or self.shutter is not None:
             made = _without(made, _READOUTS)
@@ -56,7 +56,7 @@ def _without(table: Mapping[str, Any], keys: tuple[str, ...]) -> Table:
 def read_rig_file(
     path: Path, readout: Readout | None = None, frame_size: Callable[[], Size] | None = None
 ) -> tuple[RigCard, tuple[str, ...]]:
-    """The card of a rig from rig.toml or a calibration of another tool, and the assumptions, one sentence each.
+    """Read the card of a rig from rig.toml or a calibration of another tool, and the assumptions as sentences.
 
     Args:
         path: the file, or a folder with files that belong together.
@@ -82,7 +82,7 @@ def read_rig_file(
 
 
 def tables_of_calibration(found: Calibration, readout: Readout) -> tuple[Table, tuple[str, ...]]:
-    """Tables of rig.toml, and a note on each value in seconds that needs the missing frame rate."""
+    """Return the tables of rig.toml, and a note on each value in seconds if the frame rate is missing."""
     table, notes = found.tables(), list[str]()
     given = readout.readout_ratio is not None or readout.shutter is not None
     for side, own in found.cameras.items():
@@ -103,7 +103,7 @@ def tables_of_calibration(found: Calibration, readout: Readout) -> tuple[Table, 
 def read_camera_file(
     path: Path | None, readout: Readout | None = None, frame_size: Callable[[], Size] | None = None
 ) -> tuple[OneCameraCard, tuple[str, ...]]:
-    """The card of one camera from camera.toml or a calibration of another tool; as ``read_rig_file``."""
+    """Read the card of one camera from camera.toml or a calibration of another tool; see ``read_rig_file``."""
     readout = readout or Readout()
     if path is None or path.suffix == ".toml":
         table = readout.into({} if path is None else read_toml(path))
@@ -144,7 +144,7 @@ class KnownRig(NamedTuple):
 
 
 def known_rig(path: Path, sizes: tuple[Size, Size] | None = None, fps: float | None = None) -> KnownRig:
-    """The rig of a file; see ``rsbench.read_rig``."""
+    """Read the rig of a file; see ``rsbench.read_rig``."""
     card, notes = read_rig_file(path, Readout(fps=fps), None if sizes is None else lambda: sizes[0])
     left, right = (None if side is None else side.size for side in (card.left, card.right))
     if sizes is None and (left is None or right is None):
@@ -156,7 +156,7 @@ def known_rig(path: Path, sizes: tuple[Size, Size] | None = None, fps: float | N
 
 
 def calibration_of(path: Path, given: Assumptions) -> Calibration:
-    """The calibration in any file, rig.toml and camera.toml too."""
+    """Read the calibration in any supported file, also rig.toml and camera.toml."""
     path = rig_path(path)
     if path.suffix != ".toml":
         return read_calibration(path, given)

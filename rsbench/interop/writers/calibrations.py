@@ -34,7 +34,7 @@ def write_calibration(found: Calibration, kind: str, out: Path) -> list[Path]:
 
 
 def cameras_of(found: Calibration) -> dict[Side, PinholeCamera]:
-    """The cameras by side; RsbenchError where a size is not known."""
+    """Return the cameras by side; RsbenchError if an image size is unknown."""
     made = dict[Side, PinholeCamera]()
     for side, table in found.cameras.items():
         if "width" not in table:
@@ -46,7 +46,7 @@ def cameras_of(found: Calibration) -> dict[Side, PinholeCamera]:
 
 
 def rig_of(found: Calibration) -> StereoRig | None:
-    """The rig; None for a single camera."""
+    """Return the rig; None for a single camera."""
     if found.right_from_left is None:
         return None
     cameras = cameras_of(found)
@@ -63,7 +63,7 @@ def _write_toml(found: Calibration, out: Path) -> list[Path]:
 
 
 def toml_of(found: Calibration) -> str:
-    """The text of rig.toml, or of camera.toml for one camera."""
+    """Return the text of rig.toml, or of camera.toml for one camera."""
     top, tables = dict(found.readout), found.tables()
     period = top.get("frame_period_s")
     lines = [f"# {found.format}: {', '.join(path.name for path in found.files)}"] if found.files else []
@@ -113,7 +113,7 @@ def _write_kalibr(found: Calibration, out: Path) -> list[Path]:
 
 
 def _line_delay(found: Calibration, side: Side, camera: PinholeCamera) -> float | None:
-    """Seconds from one row to the next; None if unknown."""
+    """Return the time between successive rows, seconds; None if unknown."""
     own = found.cameras[side].get("line_delay_s")
     if own is not None:
         return float(own)
@@ -136,7 +136,7 @@ def _name(camera: PinholeCamera) -> str:
 
 
 def opencv_distortion(camera: PinholeCamera, side: str) -> FloatArray:
-    """OpenCV's vector (1, n); RsbenchError for a lens that OpenCV does not have."""
+    """Return OpenCV's distortion vector (1, n); RsbenchError if OpenCV does not support the lens."""
     if camera.lens is None:
         return np.zeros((1, 5))
     if camera.lens.model == "double-sphere":
@@ -171,7 +171,7 @@ def _write_opencv(found: Calibration, out: Path) -> list[Path]:
 
 
 def rectifying(rig: StereoRig) -> dict[str, FloatArray]:
-    """R1, R2, P1, P2 of the rig's rectified frame, as ``cv2.stereoRectify`` gives them."""
+    """Return R1, R2, P1, P2 of the rig's rectified frame, as in ``cv2.stereoRectify``."""
     P1, P2 = projections(rig.camera.ideal, rig.baseline)
     return {"R1": rig.own("left").R.T, "R2": rig.own("right").R.T, "P1": P1, "P2": P2}
 

@@ -1,13 +1,13 @@
-"""COLMAP's text model and trajectories in TUM's format, of datasets and of frames that ``rsbench correct`` wrote.
+"""Export datasets and output of ``rsbench correct`` as COLMAP text models and trajectories in TUM's format.
 
 COLMAP (its documentation, "Output Format"; camera models of its ``sensor/models.h``): cameras, images with their
-poses, and points of the depth with all observations. Poses are ``cam_from_world`` with quaternions (w, x, y, z),
-camera axes as ours; (0, 0) is the corner of the image.
+poses, and points from the depth with all observations. Poses are ``cam_from_world`` with quaternions (w, x, y, z)
+and our camera axes; (0, 0) is the corner of the image.
 
 TUM RGB-D benchmark, as evo reads it: ``timestamp tx ty tz qx qy qz qw``, seconds and metres,
 ``world_from_camera``.
 
-A corrected frame is an image of a global shutter, so it has one pose: that at the time of the row to which it was
+A corrected frame is a global-shutter image, so it has a single pose, at the time of the row to which it was
 corrected.
 """
 
@@ -90,7 +90,7 @@ def _camera_lines(rig: StereoRig) -> list[str]:
 
 
 def _write_rig(sparse: Path, rig: StereoRig, lefts: list[Pose]) -> None:
-    """rigs.txt and frames.txt from the left camera's poses; the images of a frame are 2 k + 1 and 2 k + 2."""
+    """Write rigs.txt and frames.txt for the left camera's poses; frame k has the images 2 k + 1 and 2 k + 2."""
     right = rig.right_from_left
     write_lines(sparse / "rigs.txt", [f"1 2 CAMERA 1 CAMERA 2 1 {_pose_words(right)}"])
     frames = [
@@ -104,7 +104,7 @@ def _pose_words(pose: Pose) -> str:
 
 
 def camera_line(identifier: int, camera: PinholeCamera) -> str:
-    """A line of cameras.txt."""
+    """Return a line of cameras.txt."""
     lens = camera.lens
     model = "PINHOLE" if lens is None else _MODELS[lens.model]
     if lens is not None and lens.model == "brown-conrady" and lens.k3 != 0.0:
@@ -141,7 +141,7 @@ def _image_lines(sequence: Sequence, found: Surfaces) -> list[str]:
 
 
 def _point_lines(sequence: Sequence, found: Surfaces) -> list[str]:
-    """Points without an error: their observations are exact where each image has one pose."""
+    """Return the lines of points3D.txt; the reprojection errors are written as 0."""
     tracks: list[list[str]] = [[] for _ in found.world]
     for k, view in enumerate(views_in_time(sequence)):
         for place, point in enumerate(found.seen[view].index.tolist()):
@@ -184,7 +184,7 @@ def _write_tum(sequence: Sequence, root: Path, images: Images) -> Note:
 
 
 def line_times(sequence: Sequence, side: Side) -> FloatArray | None:
-    """Times (n) of all lines of all frames in the order of time, frame periods; None of a global shutter."""
+    """Return the times (n,) of all lines of all frames, ascending, frame periods; None for a global shutter."""
     if sequence.shutter.ratio_of(side) == 0.0:
         return None
     frames = range(sequence.frames)
@@ -245,15 +245,15 @@ class Corrected(NamedTuple):
 
 
 def is_corrected(folder: Path) -> bool:
-    """Whether ``rsbench correct`` made a folder."""
+    """Return whether a folder was written by ``rsbench correct``."""
     return (folder / MARKER).is_file() and not (folder / "dataset.json").exists()
 
 
 def read_corrected_folder(folder: Path) -> Corrected:
-    """A folder with its trajectory.
+    """Read a folder of corrected frames with its rig and trajectory.
 
     Raises:
-        RsbenchError: it has no trajectory, or its files hold no rig or no poses.
+        RsbenchError: the folder has no trajectory, or its files have no valid rig or poses.
     """
     path, table = folder / MARKER, folder / "trajectory.csv"
     if not table.is_file():
@@ -280,11 +280,11 @@ def read_corrected_folder(folder: Path) -> Corrected:
 
 
 def read_poses(path: Path) -> tuple[FloatArray, Pose]:
-    """Times (n,) and poses body_from_world of a file in TUM's format; RsbenchError for anything else."""
+    """Read times (n,) and poses body_from_world from a file in TUM's format; RsbenchError if it is invalid."""
     lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
     check_amount(path, "poses", len(lines), _MOST_POSES)
     table = np.zeros((0, 8))
-    with contextlib.suppress(ValueError):  # no numbers, or not as many in each line
+    with contextlib.suppress(ValueError):  # not numbers, or lines of different lengths
         table = np.array([[float(word) for word in line.split()] for line in lines], dtype=np.float64)
     good = len(table) > 0 and table.shape[1:] == (8,) and bool(np.all(np.isfinite(table)))
     lengths = np.linalg.norm(table[..., 4:], axis=-1)
@@ -295,7 +295,7 @@ def read_poses(path: Path) -> tuple[FloatArray, Pose]:
 
 
 def export_corrected(corrected: Corrected, name: str, root: Path) -> Note:
-    """The files of one folder below ``root``."""
+    """Export a folder of corrected frames to a subfolder of ``root``."""
     folder = root / corrected.name
     folder.mkdir(parents=True)
     if name == "tum":
@@ -304,7 +304,7 @@ def export_corrected(corrected: Corrected, name: str, root: Path) -> Note:
 
 
 def check_corrected(corrected: Corrected, name: str) -> None:
-    """Refuse a format that cannot represent it, with RsbenchError."""
+    """Raise RsbenchError if a format cannot represent a folder of corrected frames."""
     if name not in CORRECTED_ABOUT:
         raise RsbenchError(
             f"--to {name}: {corrected.folder} holds corrected frames, which are exported to "
@@ -320,14 +320,14 @@ def check_corrected(corrected: Corrected, name: str) -> None:
 
 
 def _of_one_time(corrected: Corrected) -> bool:
-    """Whether both frames of a pair were corrected to one time; see ``CorrectionProblem.target_time``."""
+    """Return whether both frames of a pair were corrected to the same time: ``CorrectionProblem.target_time``."""
     shutter = corrected.shutter
     by_left = (shutter.right_readout_ratio, shutter.right_size) != (None, None)
     return shutter.rows_together or (shutter.right_delay == 0.0 and (by_left or corrected.row == 0.0))
 
 
 def _camera_pose(corrected: Corrected, side: Side, body: Pose) -> Pose:
-    """cam_from_world of a camera of the rig, from the body's pose."""
+    """Return cam_from_world of a camera of the rig for a pose body_from_world."""
     offset, turn = corrected.rig.offset(side), corrected.rig.own(side).R
     return Pose(turn @ body.R, (body.t + offset) @ turn.T)
 
@@ -372,7 +372,7 @@ def _write_corrected_colmap(corrected: Corrected, folder: Path) -> Note:
 
 
 def _posed_frames(corrected: Corrected) -> list[tuple[int, Pose]]:
-    """Frames that were corrected, each with the body's pose at the time to which it was."""
+    """Return the corrected frames, each with the body's pose at the time to which it was corrected."""
     times, poses = corrected.times, corrected.poses
     if corrected.row != 0.0:
         times, poses = _at_row(corrected)
@@ -386,7 +386,7 @@ def _posed_frames(corrected: Corrected) -> list[tuple[int, Pose]]:
 
 
 def _at_row(corrected: Corrected) -> tuple[FloatArray, Pose]:
-    """Times and poses of the row to which frames were corrected, from row_poses.csv."""
+    """Return frame times and poses at the row to which frames were corrected, from row_poses.csv."""
     path = corrected.folder / "row_poses.csv"
     if not path.is_file():
         raise RsbenchError(
@@ -402,7 +402,7 @@ def _at_row(corrected: Corrected) -> tuple[FloatArray, Pose]:
 
 
 def _corrected_points(corrected: Corrected, frame: int, left: Pose, step: int, before: int) -> list[str]:
-    """Lines of points3D.txt, of every ``step``-th pixel in both directions that has depth."""
+    """Return lines of points3D.txt for every ``step``-th pixel in both directions that has depth."""
     stem, cut = f"left_{frame:06d}", slice(step // 2, None, step)
     path = corrected.folder / "depth" / f"{stem}.exr"
     if not path.is_file():

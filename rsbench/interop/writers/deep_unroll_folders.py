@@ -1,9 +1,9 @@
 """The layouts of Carla-RS and Fastec-RS (Liu, Cui, Larsson, Pollefeys, Deep Shutter Unrolling Network, CVPR 2020).
 
-Carla-RS, as its generator writes it (ethliup/UnrealCV, ``capture_rolling_shutter.py``): each camera's frames are a
-folder with gt_vel.log, wx wy wz x y z of the camera in its own axes at the first row, rad/s and m/s: the pose of a
-row that is read t seconds later is ``camera_0 from camera_t`` = (exp(w t), v t). The loader of DeepUnrollNet
-negates them. Depth is text, radial: along the ray, not z.
+Carla-RS, as written by its generator (ethliup/UnrealCV, ``capture_rolling_shutter.py``): each camera has a folder
+with its frames and gt_vel.log, which has its velocities wx wy wz x y z in its own axes at the first row, rad/s and
+m/s. A row that is read t seconds later has the pose ``camera_0 from camera_t`` = (exp(w t), v t). The loader of
+DeepUnrollNet negates the velocities. Depth is stored as text, as the distance along the ray, not as z.
 
 Fastec-RS: frames and their truth, without calibration, depth or motion, as the loader of DeepUnrollNet
 (``dataset_fastec_rs.py``) expects them.
@@ -91,7 +91,7 @@ def _write_carla(sequence: Sequence, root: Path, images: Images) -> Note:
 
 
 def first_velocity(sequence: Sequence, side: Side) -> tuple[FloatArray, FloatArray]:
-    """Angular and linear velocity (3,) of a camera in its own axes at the first row of frame 0, rad/s and m/s."""
+    """Return angular and linear velocity (3,) of a camera, in its axes at frame 0's first row, rad/s and m/s."""
     linear, angular = camera_velocity(sequence, side, float(sequence.shutter.start(0, side)))
     return angular, linear
 
@@ -115,12 +115,12 @@ def _copy_pictures(sequence: Sequence, view: View, stem: str, names: tuple[str, 
 
 
 def radial(camera: PinholeCamera, depth: NDArray[np.float32]) -> FloatArray:
-    """Distances (H, W) along the rays of depths z (H, W)."""
+    """Convert depths z (H, W) to distances (H, W) along the rays."""
     return depth * np.linalg.norm(camera.unproject(camera.pixel_grid()), axis=-1)
 
 
 def _depth_text(values: FloatArray) -> bytes:
-    """Text of ``np.savetxt`` with nine digits, which a float32 needs."""
+    """Format depth with ``np.savetxt`` and nine digits, which represent a float32 exactly."""
     stream = io.StringIO()
     np.savetxt(stream, values, fmt="%.9g")
     return stream.getvalue().encode()
@@ -142,7 +142,7 @@ def _write_carla_calibration(sequence: Sequence, folder: Path) -> None:
 
 
 def _carla_pixels(sequence: Sequence, view: View, points: Points) -> FloatArray:
-    """Pixels (n, 2) where Carla-RS's motion model sees the points."""
+    """Project points to pixels (n, 2) with the motion model of Carla-RS."""
     w, v = first_velocity(sequence, view.side)
     shutter = sequence.shutter
     tau = shutter.line_time(points.pixels[:, 1], view.frame, view.side) - shutter.start(0, view.side)
@@ -159,9 +159,9 @@ _FASTEC_ABOUT = (
     "is what those who use the layout assume."
 )
 _META = "meta.log"
-"""The loader recognises the folder of a sequence by this file, which it does not read."""
+"""File by whose presence the loader recognises the folder of a sequence; its content is not read."""
 _MOST = 1000
-"""Most frames, for numbers of three digits."""
+"""Largest number of frames, as frame numbers have three digits."""
 
 
 def _fastec_fault(sequence: Sequence, images: Images) -> str:

@@ -53,22 +53,22 @@ def export_dataset(
     only: tuple[str, ...] = (),
     progress: Progress = lambda word: None,
 ) -> list[str]:
-    """Write a dataset, or corrected frames, in another layout; ``out`` appears when all of it is written.
+    """Export a dataset or corrected frames in another layout; ``out`` is created when the export is complete.
 
     Args:
-        folder: of the dataset, or of what ``rsbench correct`` made of footage.
-        name: of the format.
-        out: a folder that is empty, missing, or of an earlier export, which is replaced.
-        images: None chooses the format's default.
-        only: names of sequences; all when empty.
-        progress: called with the name of each sequence that is written.
+        folder: folder of the dataset, or output folder of ``rsbench correct``.
+        name: name of the format.
+        out: a missing or empty folder, or an earlier export, which is replaced.
+        images: type of images; None: the default of the format.
+        only: names of sequences; empty: all.
+        progress: called with the name of each sequence.
 
     Returns:
         Sentences on what the format cannot represent of these sequences; README.txt has them too.
 
     Raises:
-        RsbenchError: no such format, no dataset, a sequence that the format cannot represent, or ``out`` cannot be
-            written.
+        RsbenchError: the format or the dataset does not exist, the format cannot represent a sequence, or ``out``
+            cannot be written.
     """
     if name not in FORMATS:
         raise RsbenchError(f"--to {name}: must be one of {', '.join(FORMATS)}")
@@ -95,7 +95,7 @@ def export_dataset(
 def _export_corrected(
     folder: Path, name: str, out: Path, images: Images | None, only: tuple[str, ...], progress: Progress
 ) -> list[str]:
-    """``export_dataset`` of what ``rsbench correct`` made of footage."""
+    """Export an output folder of ``rsbench correct``; see ``export_dataset``."""
     if images is not None or only:
         option = f"--images {images}" if images is not None else f"--sequence {only[0]}"
         raise RsbenchError(f"{option}: {folder} holds one sequence of corrected frames; leave the option out")
@@ -109,7 +109,7 @@ def _export_corrected(
 
 
 def _write_record(fresh: Path, name: str, about: str, notes: dict[str, Note], more: dict[str, Any]) -> list[str]:
-    """Write README.txt for people and export.json for programs; returns the sentences of all notes."""
+    """Write README.txt for people and export.json for programs; return the sentences of all notes."""
     sentences = [f"{key}: {sentence}" for key, (words, _) in notes.items() for sentence in words]
     record = {"format": 1, "rsbench": __version__, "to": name, "about": about, **more}
     sequences = {key: {**fields, "told": words} for key, (words, fields) in notes.items()}
@@ -120,7 +120,7 @@ def _write_record(fresh: Path, name: str, about: str, notes: dict[str, Note], mo
 
 
 def chosen_sequences(folder: Path, only: tuple[str, ...]) -> list[Sequence]:
-    """The sequences of these names, or all of a dataset without names; RsbenchError for an unknown name."""
+    """Return the sequences with these names, or all without names; RsbenchError for an unknown name."""
     sequences = read_dataset(folder)
     names = [sequence.name for sequence in sequences]
     if unknown := [name for name in only if name not in names]:

@@ -1,12 +1,12 @@
 """Training data: windows of frames as arrays, shards for WebDataset, and a folder for Hugging Face's ``datasets``.
 
-WebDataset: tar files of samples, one sample for each time of each sequence, in order and with fixed bytes. A
-sample is all files of one key, the part of a name before its first point; the part after it is a field, whose last
-suffix says how it is decoded (webdataset's ``autodecode``): png, npy, json.
+WebDataset: tar files with one sample per frame of each sequence, in order and with reproducible bytes. A sample
+consists of all files with the same key, which is the part of the file name before the first dot. The rest of the
+name is a field, whose last suffix selects the decoder (webdataset's ``autodecode``): png, npy or json.
 
 Hugging Face: ``datasets.load_dataset("imagefolder", data_dir=OUT)`` reads a folder whose metadata.jsonl has a line
-for each frame of each camera, with the columns of ImageFolder: ``file_name`` and ``gs_file_name`` become images,
-all else stays what it is.
+for each frame of each camera, with the columns of ImageFolder: ``file_name`` and ``gs_file_name`` are loaded as
+images, all other columns unchanged.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ Part = Literal["rs", "gs", "rs_depth", "gs_depth", "poses"]
 class FrameSamples:
     """Windows of successive frames of both cameras that share no frame, so that no file is read twice.
 
-    Item k is a dictionary: ``sequence``, a name; ``frame``, the first of the window; and for each side and part
-    ``left_rs`` and so on: images (frames, H, W, 3) uint8, depth (frames, H, W) float32, and of ``poses``
-    ``left_poses`` (frames, lines, 3, 4), ``cam_from_world`` of every line, and ``left_times`` (frames, lines),
-    frame periods. Times and poses are those of the sequence, whose world is the body at time 0.
+    Item k is a dictionary with the name ``sequence``, the first ``frame`` of the window, and arrays for each side
+    and part, such as ``left_rs``: images (frames, H, W, 3) uint8 or depth (frames, H, W) float32. The part
+    ``poses`` gives ``left_poses`` (frames, lines, 3, 4), ``cam_from_world`` of every line, and ``left_times``
+    (frames, lines), frame periods. The world is the body at time 0 of the sequence.
 
     Args:
         folder: of the dataset; dataset.json and each sequence.json are read here, and not again.
         frames: frames of a window; frames at the end of a sequence that do not fill one are left out.
-        parts: the parts that are read.
+        parts: the parts to read.
 
     Raises:
-        RsbenchError: not a dataset, or sequences with fewer frames than a window.
-        ValueError: no such part, or a window of no frames.
+        RsbenchError: the folder is not a dataset, or a sequence has fewer frames than a window.
+        ValueError: a part is unknown, or the window has no frames.
     """
 
     def __init__(
@@ -109,22 +109,22 @@ _WEBDATASET_ABOUT = (
     "one."
 )
 SHARD_BYTES = 256 << 20
-"""A shard with more bytes is closed."""
+"""Size above which a shard is closed and a new one started."""
 SHARD_SAMPLES = 1000
 _LINE_FIELDS = (
-    *("camera", "cameras", "right_from_left"),  # of an ideal rig the first, of another one the others
+    *("camera", "cameras", "right_from_left"),  # ideal rigs have the first, other rigs the other two
     *("baseline", "readout_ratio", "frame_period_s", "motion"),
 )
 _SAMPLE_FIELDS = (*_LINE_FIELDS, "readout_time_s", "conventions")
 
 
 def _write_shards(sequences: list[Sequence], root: Path, images: Images) -> Iterator[Note]:
-    """The samples of sequences, in shards below ``root``."""
+    """Write the samples of sequences to shards below ``root``."""
     shards = _Shards(root)
     try:
         for number, sequence in enumerate(sequences):
             for frame in range(sequence.frames):
-                # A point would end the key: the number distinguishes names that differ in points alone.
+                # A dot would end the key; the number distinguishes names that differ only in dots.
                 key = f"{number:06d}-{sequence.name.replace('.', '_')}-{frame:04d}"
                 shards.add({f"{key}.{name}": data for name, data in _sample_files(sequence, frame).items()})
             yield _left_out("samples", sequence, []), {"samples": sequence.frames}
@@ -133,7 +133,7 @@ def _write_shards(sequences: list[Sequence], root: Path, images: Images) -> Iter
 
 
 class _Shards:
-    """Tar files, each closed when full."""
+    """Writer of tar files; a new one is started when the current one is full."""
 
     def __init__(self, root: Path) -> None:
         self._root, self._count, self._samples, self._bytes = root, 0, 0, 0
@@ -141,11 +141,11 @@ class _Shards:
         self._shard: tarfile.TarFile | None = None
 
     def add(self, files: dict[str, bytes]) -> None:
-        """One sample, whole in one shard."""
+        """Add a sample; all its files are in the same shard."""
         if self._shard is None or self._samples >= SHARD_SAMPLES or self._bytes > SHARD_BYTES:
             self._shard = self._next()
         for name, data in files.items():
-            header = tarfile.TarInfo(name)  # no owner, time 0: the same bytes at every run
+            header = tarfile.TarInfo(name)  # without owner and time, so that the bytes are reproducible
             header.size = len(data)
             self._shard.addfile(header, io.BytesIO(data))
             self._bytes += len(data)
@@ -174,7 +174,7 @@ def _left_out(place: str, sequence: Sequence, more: list[str]) -> list[str]:
 
 
 def _sample_files(sequence: Sequence, frame: int) -> dict[str, bytes]:
-    """Files of one sample by the part of their names after the first point."""
+    """Return the files of a sample by the part of their names after the first dot."""
     fields = dict[str, bytes]()
     for side in SIDES:
         parts: tuple[Part, ...] = ("rs_depth", "gs_depth", "poses")
@@ -215,7 +215,7 @@ Rolling-shutter stereo, made by rsbench. {about}"""
 
 
 def _write_folder(sequences: list[Sequence], root: Path, images: Images) -> Iterator[Note]:
-    """Files and lines of sequences below ``root``."""
+    """Write the files and the metadata lines of sequences below ``root``."""
     lines = list[str]()
     for sequence in sequences:
         known = {name: sequence.manifest[name] for name in _LINE_FIELDS if name in sequence.manifest}

@@ -2,12 +2,12 @@
 
 KITTI's odometry benchmark: image_2 (left), image_3 (right), calib.txt, times.txt, poses (3 x 4
 ``world_from_camera`` of the left camera, the first being the identity); its stereo benchmark: disp_occ_0, a PNG of
-16 bits, disparity times 256, 0 where it is not known.
+16 bits, disparity times 256, 0 where unknown.
 
 Kalibr's camchain.yaml and imu.yaml have the fields of ``kalibr_common/ConfigReader.py``; ``line_delay`` (s) is
-what its rolling-shutter calibration writes. ``T_cn_cnm1`` transforms from the previous camera.
+a result of its rolling-shutter calibration. ``T_cn_cnm1`` is the transform from the previous camera.
 
-Pixels are ours in both: (0, 0) is the centre of the first one.
+Both have our pixel convention: (0, 0) is the centre of the first pixel.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _write_kitti(sequence: Sequence, root: Path, images: Images) -> Note:
 
 
 def disparity_values(disparity: FloatArray) -> tuple[NDArray[np.uint16], int]:
-    """Values of the PNG for disparities (H, W) px, NaN where unknown; and how many it cannot represent."""
+    """Return PNG values of disparities (H, W) px, NaN where unknown, and how many cannot be represented."""
     scaled = np.round(_SCALE * np.nan_to_num(disparity, nan=0.0))
     representable = (scaled >= 1.0) & (scaled <= _LARGEST)
     beyond = np.count_nonzero(np.isfinite(disparity) & ~representable)
@@ -102,7 +102,7 @@ def disparity_values(disparity: FloatArray) -> tuple[NDArray[np.uint16], int]:
 
 
 def _kitti_calibration(sequence: Sequence) -> list[str]:
-    """P0 to P3 (3 x 4) from the frame of the left camera; the grey cameras 0 and 1 stand where 2 and 3 do."""
+    """Return P0 to P3 (3 x 4) in the left camera's axes; the grey cameras 0 and 1 are equal to 2 and 3."""
     both = projections(sequence.rig.camera, sequence.rig.baseline)
     return [f"P{k}: {numbers(both[k % 2])}" for k in range(4)]
 
@@ -160,13 +160,13 @@ def _kalibr_camera(sequence: Sequence, side: Side) -> list[str]:
 
 
 def write_chain(path: Path, cameras: Iterable[list[str]]) -> None:
-    """A camera chain of the lines of each camera."""
+    """Write a camera chain from the lines of each camera."""
     lines = [line for k, own in enumerate(cameras) for line in (f"cam{k}:", *(f"  {each}" for each in own))]
     write_lines(path, lines)
 
 
 def kalibr_camera(camera: PinholeCamera, side: Side, line_delay_s: float | None) -> list[str]:
-    """Lines of a camera of camchain.yaml; its lens must be one of ``KALIBR_LENSES``."""
+    """Return the lines of a camera in camchain.yaml; its lens must be one of ``KALIBR_LENSES``."""
     lens = camera.lens
     model, distortion = ("pinhole", "none") if lens is None else KALIBR_LENSES[lens.model]
     coefficients = () if lens is None else lens.coefficients[:4]
@@ -183,7 +183,7 @@ def kalibr_camera(camera: PinholeCamera, side: Side, line_delay_s: float | None)
 
 
 def yaml_transform(name: str, pose: Pose) -> list[str]:
-    """Lines of a matrix (4, 4)."""
+    """Return the lines of a matrix (4, 4)."""
     return [f"{name}:", *(f"- {_yaml_list(row)}" for row in matrix(pose).tolist())]
 
 

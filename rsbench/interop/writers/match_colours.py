@@ -44,7 +44,7 @@ class Scene(NamedTuple):
 
 
 def labelled_strips(sequence: Sequence) -> Iterator[Strips]:
-    """The channel ``matches``: correct ones green, others orange; matches beyond the last frame are missing.
+    """Yield the channel ``matches``, correct ones green and others orange, up to the last frame.
 
     Raises:
         RsbenchError: the sequence has no such channel, or it cannot be read.
@@ -61,7 +61,7 @@ def labelled_strips(sequence: Sequence) -> Iterator[Strips]:
 
 
 def found_strips(sequence: Sequence, features: str) -> Iterator[Strips]:
-    """Matches of a feature matcher in the first two frames, without ground truth.
+    """Find matches in the first two frames with a feature matcher, without ground truth.
 
     Raises:
         RsbenchError: no such feature matcher.
@@ -76,5 +76,5 @@ def found_strips(sequence: Sequence, features: str) -> Iterator[Strips]:
 
 
 def line_seconds(sequence: Sequence, view: View) -> FloatArray:
-    """(lines,) s, the times of an image's lines, in the order of the image."""
+    """Return the times (lines,) of an image's lines, s, in the order of the image."""
     return sequence.frame_period_s * sequence.shutter.line_times(view.frame, view.side)

@@ -1,9 +1,9 @@
 """Corrected frames as rectified global-shutter pairs, with the calibration that stereo and SLAM programs read.
 
-A corrected frame has the pixels of its own camera. Here it is resampled, once more, to a camera without a lens
-that looks along the rig's body axes: the cameras of the pair then differ by a shift along their rows alone, as
-after OpenCV's stereoRectify, whose names and conventions R1, R2, P1, P2 and Q have. Frames of an ideal rig without
-a lens are such pairs, and stay as they are.
+A corrected frame has the pixel grid of its own camera. Here it is resampled to a camera without distortion whose
+axes are the body axes of the rig: the cameras of the pair then differ only by a translation along their rows, as
+after OpenCV's stereoRectify. R1, R2, P1, P2 and Q have OpenCV's conventions. Frames of an ideal rig without
+distortion are rectified already and are not resampled.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from rsbench.vision.images import resample
 
 FOLDER = "rectified"
 _ONE_SURFACE = 1.05
-"""Depths around a pixel of ratios below this are of one surface, and are interpolated; others are not mixed."""
+"""Largest ratio of the depths around a pixel up to which they belong to one surface and are interpolated."""
 
 
 def rectified_camera(rig: StereoRig) -> PinholeCamera:
-    """Both cameras of the rectified pair, in the body's axes."""
+    """Return the camera model of both cameras of the rectified pair, whose axes are the body axes."""
     if rig.rectified or not rig.aligned:
         return rig.camera
     focal = float(np.mean(rig.camera.central_focal))
@@ -40,7 +40,7 @@ def rectified_camera(rig: StereoRig) -> PinholeCamera:
 
 
 def rectify(fused: Fused, rig: StereoRig, side: Side) -> Fused:
-    """A corrected frame in the pixels of ``rectified_camera``, its depth along that camera's axis."""
+    """Resample a corrected frame to ``rectified_camera``; the depth is z in that camera."""
     if rig.rectified:
         return fused
     camera, sensor = rectified_camera(rig), rig.sensor(side)
@@ -62,9 +62,9 @@ def rectify(fused: Fused, rig: StereoRig, side: Side) -> Fused:
 def _inverse_depth(
     depth: NDArray[np.float32], pixels: FloatArray, row: NDArray[np.intp], column: NDArray[np.intp]
 ) -> FloatArray:
-    """1 / z of a depth map at pixels (H, W, 2) beside (row, column); NaN where it is unknown.
+    """Interpolate 1 / z of a depth map at pixels (H, W, 2), whose nearest are (row, column); NaN where unknown.
 
-    Of planes 1 / z is linear in the pixel of a camera without a lens, and nearly so through one.
+    For a plane, 1 / z is a linear function of the pixel without distortion, and nearly linear with distortion.
     """
     known = np.where(depth > 0.0, depth, np.nan)
     inverse = np.where(np.isnan(known), np.float32(-1.0), np.float32(1.0) / known).astype(np.float32)
@@ -78,7 +78,7 @@ def _inverse_depth(
 
 
 def rectification(rig: StereoRig) -> dict[str, FloatArray]:
-    """R1, R2 (3, 3), P1, P2 (3, 4) and Q (4, 4), as OpenCV's stereoRectify names them; metres."""
+    """Return R1, R2 (3, 3), P1, P2 (3, 4) and Q (4, 4), as in OpenCV's stereoRectify; metres."""
     camera = rectified_camera(rig)
     P1, P2 = projections(camera, rig.baseline)
     ratio = camera.fx / camera.fy
@@ -95,7 +95,7 @@ def rectification(rig: StereoRig) -> dict[str, FloatArray]:
 
 
 def write_rectified(folder: Path, name: str, fused: Fused, rig: StereoRig, side: Side) -> None:
-    """NAME.png, depth/NAME.exr, disparity/NAME.png and mask/NAME.png below ``folder`` / rectified."""
+    """Write NAME.png, depth/NAME.exr, disparity/NAME.png and mask/NAME.png below ``folder`` / rectified."""
     place, frame = folder / FOLDER, rectify(fused, rig, side)
     for part in ("depth", "disparity", "mask"):
         (place / part).mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,7 @@ def write_rectified(folder: Path, name: str, fused: Fused, rig: StereoRig, side:
 
 
 def write_calibration(folder: Path, rig: StereoRig) -> None:
-    """calibration.yml, for OpenCV's FileStorage, and cameras.txt of COLMAP below ``folder`` / rectified."""
+    """Write calibration.yml, for OpenCV's FileStorage, and COLMAP's cameras.txt below ``folder`` / rectified."""
     place, camera = folder / FOLDER, rectified_camera(rig)
     storage = cv2.FileStorage(str(place / "calibration.yml"), cv2.FILE_STORAGE_WRITE)
     for key, value in (("image_width", camera.width), ("image_height", camera.height)):

@@ -3,8 +3,8 @@
 The world is that of the sequence (metres, x right, y down, z forward), and the one timeline is ``time``, seconds:
 the rig is shown at its pose at that time. Pixels of Rerun are counted from the corner of the image.
 
-    world/left, world/right               cameras, moved at the time of every line
-    world/left/image                      the frame on their plane
+    world/left, world/right               cameras, with a pose at the time of every line
+    world/left/image                      the frame on its image plane
     world/lines/left_0                    camera positions of the lines of a frame, yellow to blue in time
     world/points/left_0                   surface points of its depth, each pixel from the pose of its line
     frames/left/rs, gs, depth             frame, its global-shutter twin, and the depth of the frame
@@ -45,7 +45,7 @@ _FIRST_LINE, _LAST_LINE = np.array([240, 228, 66]), np.array([0, 114, 178])
 _PLANE = 0.8
 """Distance of the image from its camera, as drawn, in baselines."""
 _LINE_RADIUS, _POINT_RADIUS, _STRIP_RADIUS = 0.005, 1.5, 0.7
-"""The first in baselines, the others in pixels of the screen."""
+"""Sizes of drawn lines and points: the first in baselines, the others in pixels of the screen."""
 Progress = Callable[[str], None]
 
 
@@ -64,7 +64,7 @@ def log_scene(recording: rr.RecordingStream, scene: Scene, progress: Progress = 
 
 
 def blueprint() -> rrb.Blueprint:
-    """The world beside the tabs of both cameras."""
+    """Return the layout of the viewer: the world next to tabs for both cameras."""
     cameras = [rrb.Tabs(*_tabs(side), name=f"{side} camera") for side in SIDES]
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -88,7 +88,7 @@ def _tabs(side: Side) -> list[rrb.Spatial2DView]:
 
 
 def _log_camera(recording: rr.RecordingStream, sequence: Sequence, side: Side) -> None:
-    """A camera, and its pose at the time of every line of every frame."""
+    """Log a camera and its pose at the time of every line of every frame."""
     camera = sequence.rig.sensor(side)
     recording.log(
         f"world/{side}",
@@ -123,7 +123,7 @@ def _log_frame(recording: rr.RecordingStream, sequence: Sequence, view: View) ->
 
 
 def _log_lines(recording: rr.RecordingStream, sequence: Sequence, view: View) -> None:
-    """The positions of a camera while a frame was read."""
+    """Log the positions of a camera during the readout of a frame."""
     places, seconds = inverse(line_poses(sequence, view)).t, line_seconds(sequence, view)
     late = (seconds - seconds.min()) / max(float(np.ptp(seconds)), 1e-12)
     colours = (_FIRST_LINE + late[:, None] * (_LAST_LINE - _FIRST_LINE)).astype(np.uint8)
@@ -154,7 +154,7 @@ def _log_matches(recording: rr.RecordingStream, sequence: Sequence, strips: Iter
 
 
 def write_recording(scene: Scene, path: Path, progress: Progress) -> None:
-    """A file that ``rerun PATH`` opens."""
+    """Write a file that ``rerun PATH`` opens."""
     with rr.RecordingStream("rsbench", recording_id=scene.sequence.name) as recording:
         recording.save(path, default_blueprint=blueprint())
         log_scene(recording, scene, progress)

@@ -1,8 +1,8 @@
 """Shared parts of the exports: poses of images, pixel conventions, surface points, and the row-motion error.
 
-Surface points are world points of depth maps and where the images of a sequence see them, exactly: what a
-reconstruction holds. The row-motion error is the distance, px, of a format's model of how a camera moves during
-the readout from the true motion.
+Surface points are world points from depth maps, with their exact pixels in the images of a sequence, as in a
+reconstruction. The row-motion error is the largest distance, px, between the projections of points under a
+format's model of the motion during readout and under the true motion.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from rsbench.storage.files import write_bytes
 from rsbench.storage.untrusted_files import inside, read_bytes
 
 Note = tuple[list[str], dict[str, Any]]
-"""What a format cannot represent of a sequence, in sentences; and fields of its record in export.json."""
+"""Sentences about data of a sequence that a format cannot represent, and fields of its record in export.json."""
 Images = Literal["rs", "gs"]
 """Rolling-shutter frames, or their global-shutter twins from the pose of the line that is read first."""
 CORNER_PX = 0.5
-"""Added to pixels for formats with (0, 0) at the corner of the image; ours is the centre of the first pixel."""
+"""Offset added to pixels for formats with (0, 0) at the image corner; ours is the centre of the first pixel."""
 
 
 class Format(NamedTuple):
     """A layout of another project."""
 
     about: str
-    """What its files hold, for README.txt."""
+    """Description of its files, for README.txt."""
     images: tuple[Images, ...]
-    """The images that it can be made of, the default first; empty where it holds none, or both."""
+    """Types of images that can be exported, the default first; empty if the format has none, or both."""
     write: Callable[[list[Sequence], Path, Images], Iterator[Note]]
-    """Writes sequences to files below a root; yields after each."""
+    """Function that writes sequences to files below a root folder and yields a note after each."""
     fault: Callable[[Sequence, Images], str] = lambda sequence, images: ""
-    """Why a sequence cannot be written, with a remedy; empty where it can."""
+    """Function that returns why a sequence cannot be written, with a remedy; empty if it can."""
 
 
 class View(NamedTuple):
@@ -62,36 +62,36 @@ class View(NamedTuple):
 def one_by_one(
     write: Callable[[Sequence, Path, Images], Note],
 ) -> Callable[[list[Sequence], Path, Images], Iterator[Note]]:
-    """``Format.write`` from a function that writes one sequence to files of its own."""
+    """Return ``Format.write`` for a function that writes the separate files of one sequence."""
     return lambda sequences, root, images: (write(sequence, root, images) for sequence in sequences)
 
 
 def views_in_time(sequence: Sequence) -> list[View]:
-    """Left 0, right 0, left 1, and so on."""
+    """Return the views in the order left 0, right 0, left 1, and so on."""
     return [View(side, frame) for frame in range(sequence.frames) for side in SIDES]
 
 
 def first_pose(sequence: Sequence, view: View) -> Pose:
-    """``cam_from_world`` (3, 3), (3,) of the line that is read first: that of the global-shutter twin."""
+    """Return ``cam_from_world`` of the line that is read first, which is also that of the global-shutter twin."""
     start = sequence.shutter.start(view.frame, view.side)
     return sequence.rig.cam_from_world(sequence.motion, start, view.side)
 
 
 def line_poses(sequence: Sequence, view: View) -> Pose:
-    """``cam_from_world`` (lines, 3, 3), (lines, 3) in the order of the image."""
+    """Return ``cam_from_world`` (lines, 3, 3), (lines, 3) of all lines, in the order of the image."""
     return row_poses(sequence.rig, sequence.shutter, sequence.motion, view.side, view.frame)
 
 
 def first_second(sequence: Sequence, view: View) -> float:
-    """Time of the line that is read first, s; 0 is row 0 of frame 0."""
+    """Return the time of the line that is read first, s; 0 is the time of row 0 in frame 0."""
     return sequence.frame_period_s * float(sequence.shutter.start(view.frame, view.side))
 
 
 def camera_velocity(sequence: Sequence, side: Side, tau: float) -> tuple[FloatArray, FloatArray]:
-    """Linear and angular velocity (3,) of a camera in its own axes, m/s and rad/s, at a time in frame periods.
+    """Return the linear and angular velocity (3,) of a camera in its own axes, m/s and rad/s, at frame period tau.
 
-    A point of the world is at x = R X + t in the camera and R' = [w]x R, so it moves by w x (x - t) + t', which is
-    -(v + a x x) of a camera that moves by v and turns by a: a = -w, v = w x t - t'.
+    A world point X has camera coordinates x = R X + t with R' = [w]x R, and the velocity w x (x - t) + t'. For a
+    camera with velocity v and angular velocity a it is -(v + a x x), hence a = -w and v = w x t - t'.
     """
     w, rate = (sequence.rig.own(side).R @ each for each in sequence.motion.velocity(tau))
     t = sequence.rig.cam_from_world(sequence.motion, tau, side).t
@@ -99,69 +99,69 @@ def camera_velocity(sequence: Sequence, side: Side, tau: float) -> tuple[FloatAr
 
 
 def matrix(pose: Pose) -> FloatArray:
-    """Homogeneous (..., 4, 4) of a transform."""
+    """Return the homogeneous matrix (..., 4, 4) of a transform."""
     out = np.zeros((*pose.t.shape[:-1], 4, 4))
     out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = pose.R, pose.t, 1.0
     return out
 
 
 def world_from_camera(pose: Pose) -> FloatArray:
-    """Homogeneous (..., 4, 4) of the inverse of ``cam_from_world``."""
+    """Return the homogeneous matrix (..., 4, 4) of the inverse of ``cam_from_world``."""
     return matrix(inverse(pose))
 
 
 def step_of(camera: PinholeCamera, wanted: float) -> int:
-    """Distance between pixels, px, at which some ``wanted`` of an image are taken."""
+    """Return the grid spacing, px, at which about ``wanted`` pixels of an image are sampled."""
     return max(math.ceil(math.sqrt(camera.width * camera.height / wanted)), 1)
 
 
 def corner_matrix(camera: PinholeCamera) -> FloatArray:
-    """Calibration matrix (3, 3), lens apart, of pixels whose (0, 0) is the corner of the image."""
+    """Return the calibration matrix (3, 3), without the lens, for pixels with (0, 0) at the image corner."""
     K = camera.ideal.K
     K[:2, 2] += CORNER_PX
     return K
 
 
 def copy_image(sequence: Sequence, view: View, images: Images, path: Path) -> None:
-    """The PNG of a view, byte for byte."""
+    """Copy the PNG file of a view unchanged."""
     copy_file(sequence.folder, picture_file(images, view.side, view.frame + sequence.first), path)
 
 
 def copy_file(folder: Path, name: str, to: Path) -> None:
-    """A file of a folder, byte for byte."""
+    """Copy a file of a folder unchanged."""
     to.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(to, read_bytes(inside(folder, name)))
 
 
 def projections(camera: PinholeCamera, baseline: float) -> tuple[FloatArray, FloatArray]:
-    """P1, P2 (3, 4) of a rectified pair, as OpenCV's stereoRectify names them; from the left camera's axes."""
+    """Return P1, P2 (3, 4) of a rectified pair, as in OpenCV's stereoRectify, in the left camera's axes."""
     right = np.column_stack([camera.K, [-camera.fx * baseline, 0.0, 0.0]])
     return np.column_stack([camera.K, np.zeros(3)]), right
 
 
 def number(value: float) -> str:
-    """A decimal number that reads back exactly, with a point: YAML 1.1 reads 1e-05 as text."""
+    """Format a number exactly, with a decimal point, because YAML 1.1 reads 1e-05 as text."""
     text = repr(float(value))
     return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
 
 def numbers(values: object) -> str:
-    """Decimal numbers separated by blanks, row by row."""
+    """Format numbers row by row, separated by blanks."""
     return " ".join(number(value) for value in np.ravel(np.asarray(values, dtype=np.float64)))
 
 
 def write_lines(path: Path, lines: list[str]) -> None:
-    """Text in UTF-8, every line terminated."""
+    """Write lines as UTF-8 text; every line is terminated."""
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
 def reads_from_top(sequence: Sequence) -> bool:
-    """Whether both cameras read their rows from the top."""
+    """Return whether both cameras read their rows from top to bottom."""
     return {sequence.shutter.scan_of(side) for side in SIDES} == {"top"}
 
 
 def lens_fault(rig: StereoRig, *known: LensModel) -> str:
-    """Why a format that supports only these lenses cannot represent a rig; empty if it can."""
+    """Return why a format that supports only these lens models cannot represent a rig; empty if it can."""
     for side in SIDES:
         lens = rig.sensor(side).lens
         if lens is not None and lens.model not in known:
@@ -171,7 +171,7 @@ def lens_fault(rig: StereoRig, *known: LensModel) -> str:
 
 
 def about_moving_objects(sequence: Sequence) -> list[str]:
-    """A sentence about moving objects, for formats of a static world."""
+    """Return a note on moving objects, if there are any, for formats with a static scene."""
     if not sequence.moving:
         return []
     count = len(sequence.moving)
@@ -179,16 +179,16 @@ def about_moving_objects(sequence: Sequence) -> list[str]:
 
 
 _POINTS = 50_000
-"""Points of a sequence, approximately."""
+"""Approximate number of points of a sequence."""
 _MOST_OF_AN_IMAGE = 2_000
 _AROUND = 4
-"""Frames before and after its own in which a point is searched."""
+"""Number of frames before and after its own frame in which a point is searched."""
 _SAME = 2e-3
-"""Largest relative difference between the depths of a point and of the visible surface."""
+"""Tolerance of the relative difference between the depths of a point and of the visible surface."""
 
 
 class Points(NamedTuple):
-    """Points (n) of the surfaces of one image."""
+    """Surface points (n) of one image."""
 
     world: FloatArray
     """(n, 3) m, in the world of the sequence."""
@@ -199,27 +199,27 @@ class Points(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """The points of a list that an image sees, and their pixels."""
+    """Points that are visible in an image, as indices into a list of points, and their pixels."""
 
     index: NDArray[np.int64]
     """(m,)"""
     pixels: FloatArray
-    """(m, 2) exact, not whole."""
+    """(m, 2) exact projections, not rounded."""
 
 
 class Surfaces(NamedTuple):
-    """Points of all images of a sequence, each seen by at least two."""
+    """Points of all images of a sequence, each visible in at least two images."""
 
     world: FloatArray
     """(n, 3)"""
     colours: NDArray[np.uint8]
     """(n, 3)"""
     seen: dict[View, Observations]
-    """Indices into the points."""
+    """Visible points of each view."""
 
 
 def world_points(sequence: Sequence, view: View, images: Images, step: int) -> Points:
-    """Points at every ``step``-th pixel in both directions, where a static surface has depth."""
+    """Return points at every ``step``-th pixel in both directions that shows a static surface."""
     depth = sequence.depth(images, view.side, view.frame)
     still = (depth > 0) & (numbers_of(sequence.labels(images, view.side, view.frame)) == 0)
     grid = np.zeros_like(still)
@@ -232,7 +232,7 @@ def world_points(sequence: Sequence, view: View, images: Images, step: int) -> P
 
 
 def pixel_poses(sequence: Sequence, view: View, images: Images, pixels: NDArray[np.int64]) -> Pose:
-    """``cam_from_world`` (n, 3, 3), (n, 3) at which an image sees whole pixels (n, 2)."""
+    """Return ``cam_from_world`` (n, 3, 3), (n, 3) at the times of integer pixels (n, 2) of an image."""
     if images == "gs":
         still = first_pose(sequence, view)
         return Pose(*(np.broadcast_to(part, (len(pixels), *part.shape)) for part in still))
@@ -241,7 +241,7 @@ def pixel_poses(sequence: Sequence, view: View, images: Images, pixels: NDArray[
 
 
 def observe(sequence: Sequence, view: View, images: Images, world: FloatArray) -> Observations:
-    """Points (n, 3) that an image sees: inside it, seen once, and not behind the surface of its depth."""
+    """Select the points (n, 3) that project into an image exactly once and are not occluded in its depth map."""
     rig, shutter, motion = sequence.rig, sequence.shutter, sequence.motion
     if images == "gs":
         start = shutter.start(view.frame, view.side)
@@ -258,7 +258,7 @@ def observe(sequence: Sequence, view: View, images: Images, world: FloatArray) -
 
 
 def _on_surface(depth: NDArray[np.float32], pixels: FloatArray, z: FloatArray) -> NDArray[np.bool_]:
-    """Whether a map (H, W) shows points at depths (n) at pixels (n, 2); on a plane 1 / z is linear."""
+    """Return whether points at pixels (n, 2) and depths (n) lie on a depth map (H, W), interpolated in 1 / z."""
     height, width = depth.shape
     if min(height, width) < 2:
         return np.zeros(len(z), dtype=np.bool_)
@@ -274,7 +274,7 @@ def _on_surface(depth: NDArray[np.float32], pixels: FloatArray, z: FloatArray) -
 
 
 def surfaces(sequence: Sequence, images: Images) -> Surfaces:
-    """Points of the depth of every image, and every image near in time that sees them."""
+    """Return surface points from the depth of every image, and the nearby frames in which they are visible."""
     views = views_in_time(sequence)
     wanted = min(_MOST_OF_AN_IMAGE, max(_POINTS // len(views), 1))
     worlds, colours, origins = list[FloatArray](), list[NDArray[np.uint8]](), list[NDArray[np.int64]]()
@@ -294,7 +294,7 @@ def surfaces(sequence: Sequence, images: Images) -> Surfaces:
 
 
 def _seen_twice(found: Surfaces) -> Surfaces:
-    """The points that at least two images see."""
+    """Select the points that are visible in at least two images."""
     counts = np.zeros(len(found.world), dtype=np.int64)
     for each in found.seen.values():
         np.add.at(counts, each.index, 1)
@@ -308,40 +308,40 @@ def _seen_twice(found: Surfaces) -> Surfaces:
 
 
 Law = Callable[[View, Points], FloatArray]
-"""A format's motion model: pixels (n, 2), in our convention, where the lines of ``points.pixels`` see them."""
+"""A format's motion model: projects points to pixels (n, 2), in our convention, at the pose of their lines."""
 _TRIED = 5_000
-"""Pixels of each image that are compared."""
+"""Approximate number of pixels of each image that are compared."""
 
 
 def compare_rows(sequence: Sequence, views: list[View], law: Law, name: str) -> Note:
-    """The largest distance, px, between points of the depth in frames and by a law, and a sentence if it is not 0.
+    """Return the largest distance, px, between true pixels and a format's projections, and a note above 1e-6 px.
 
-    Each point is projected with the law's pose of the line that saw it. 0 where no image has depth; 1e-6 px is the
-    accuracy to which our own numbers read back.
+    Each point is projected at the pose that the motion model gives to its line. The distance is 0 if no image has
+    depth; 1e-6 px is the accuracy with which written numbers are read back.
     """
     error = 0.0
     for view in views:
         points = world_points(sequence, view, "rs", step_of(sequence.rig.sensor(view.side), _TRIED))
         away = np.linalg.norm(law(view, points) - points.pixels, axis=-1)
-        # NaN: behind the camera, a large error
+        # NaN: the point is behind the camera, which is an infinite error
         error = max(error, float(np.max(np.nan_to_num(away, nan=math.inf), initial=0.0)))
     sentence = f"the format's motion of the rows ({name}) is up to {error:.2g} px from the true one"
     return [] if error < 1e-6 else [sentence], {"largest_row_error_px": error}
 
 
 def seen_by(sequence: Sequence, side: Side, poses: Pose, world: FloatArray) -> FloatArray:
-    """Pixels (n, 2) of world points (n, 3) in a camera with poses ``cam_from_world`` (n, 3, 3), (n, 3)."""
+    """Project world points (n, 3) to pixels (n, 2) of a camera with poses ``cam_from_world`` (n, 3, 3), (n, 3)."""
     return sequence.rig.sensor(side).project(transform(poses, world))
 
 
 def line_delay(sequence: Sequence, side: Side) -> float:
-    """Seconds from each line of a camera to the next."""
+    """Return the time between successive lines of a camera, seconds."""
     shutter = sequence.shutter
     return shutter.ratio_of(side) * sequence.frame_period_s / shutter.lines(side)
 
 
 def lines_of(sequence: Sequence, view: View, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The number of lines that were read before those of pixels (n, 2)."""
+    """Return the number of lines (n,) that are read before those of pixels (n, 2)."""
     shutter = sequence.shutter
     lines = pixels[:, shutter.axis(view.side)]
     return np.abs(lines - shutter.first_line(view.side))

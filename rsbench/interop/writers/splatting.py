@@ -5,16 +5,16 @@ code puts the centre of the first pixel at (0.5, 0.5) (``Cameras.get_image_coord
 
 3dgs-deblur (Seiskari et al., Gaussian Splatting on the Move, ECCV 2024): ``camera_linear_velocity`` (m/s) and
 ``camera_angular_velocity`` (rad/s) are those of the camera itself in its own axes, and ``rolling_shutter_time``
-is the readout time, s. Its rasterizer (SpectacularAI/gsplat, ``forward.cu``) shifts what the pose sees by ``(y /
-height - 0.5) * rolling_shutter_time`` times the velocity of the pixel, y = 0.5 in row 0: the pose is that of row
-(height - 1) / 2, and the model is of first order in pixels.
+is the readout time, s. Its rasterizer (SpectacularAI/gsplat, ``forward.cu``) shifts each projection by
+``(y / height - 0.5) * rolling_shutter_time`` times the velocity of the pixel, with y = 0.5 in row 0. So the pose
+is that of row (height - 1) / 2, and the model is a first-order approximation in pixels.
 
 gsplat (``gsplat.rasterization`` and ``gsplat/cuda/_torch_cameras.py``) interpolates the rows between two view
 matrices: ``viewmats`` are ``cam_from_world`` of the line that is read first, ``viewmats_rs`` of the one that is
 read last; the relative time of a pixel's line is ``floor(y) / (height - 1)`` (``(height - ceil(y)) / (height -
 1)`` from the bottom; columns likewise), where y = 0.5 is the centre of row 0; translations are interpolated
-linearly, rotations along their arc. Both are those of our model ``linear``. Lenses are OpenCV's, and a line is
-that of the distorted pixel, as ours.
+linearly, rotations at constant angular velocity, as in our model ``linear``. Lenses are OpenCV's, and the line is
+that of the distorted pixel, as in ours.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def _write_nerfstudio(sequence: Sequence, root: Path, images: Images) -> Note:
 
 
 def camera_fields(sequence: Sequence) -> dict[str, Any]:
-    """Top-level fields of transforms.json; intrinsics of cameras that differ are in each frame instead."""
+    """Return the top-level fields of transforms.json; if the intrinsics differ, each frame has its own instead."""
     model = {"camera_model": _camera_model(sequence.rig.sensor("left"))}
     return model | (_intrinsics(sequence.rig.camera) if sequence.rig.aligned else {})
 
@@ -136,7 +136,7 @@ def _opencv_coefficients(lens: Lens | None) -> dict[str, float]:
 
 
 def _exposures(sequence: Sequence) -> set[float]:
-    """Exposure times of all frames, s; 0 for an ideal sensor."""
+    """Return the different exposure times of all frames, s; 0 for an ideal sensor."""
     sensor = sequence.sensor
     return {sensor.of(side, frame).exposure_s if sensor else 0.0 for side, frame in views_of(sequence.frames)}
 
@@ -155,18 +155,18 @@ def _frame(sequence: Sequence, view: View, images: Images) -> dict[str, Any]:
 
 
 def middle_time(sequence: Sequence, view: View) -> float:
-    """Time of row (height - 1) / 2, frame periods."""
+    """Return the time of the middle line, such as row (height - 1) / 2, frame periods."""
     shutter = sequence.shutter
     return float(shutter.line_time((shutter.lines(view.side) - 1) / 2, view.frame, view.side))
 
 
 def middle_pose(sequence: Sequence, view: View) -> Pose:
-    """``cam_from_world`` (3, 3), (3,) of row (height - 1) / 2."""
+    """Return ``cam_from_world`` (3, 3), (3,) of the middle line."""
     return sequence.rig.cam_from_world(sequence.motion, middle_time(sequence, view), view.side)
 
 
 def _deblur_pixels(sequence: Sequence, view: View, points: Points) -> FloatArray:
-    """Pixels (n, 2) where 3dgs-deblur's motion model sees the points."""
+    """Project points to pixels (n, 2) with the motion model of 3dgs-deblur."""
     pose, camera = middle_pose(sequence, view), sequence.rig.sensor(view.side)
     x = points.world @ pose.R.T + pose.t
     linear, angular = camera_velocity(sequence, view.side, middle_time(sequence, view))
@@ -214,7 +214,7 @@ def _write_gsplat(sequence: Sequence, root: Path, images: Images) -> Note:
 
 
 def ends(sequence: Sequence, view: View) -> tuple[Pose, Pose]:
-    """``cam_from_world`` of the lines that are read first and last."""
+    """Return ``cam_from_world`` of the lines that are read first and last."""
     poses, first = line_poses(sequence, view), sequence.shutter.first_line(view.side)
     last = sequence.shutter.lines(view.side) - 1 - first
     return Pose(poses.R[first], poses.t[first]), Pose(poses.R[last], poses.t[last])
@@ -235,7 +235,7 @@ def _arrays(sequence: Sequence, views: list[View], images: Images) -> dict[str, 
 
 
 def _gsplat_coefficients(lens: Lens | None) -> dict[str, list[float]]:
-    """gsplat's arrays of a lens."""
+    """Return the arrays by which gsplat describes a lens."""
     if lens is None:
         return {}
     if lens.model == "kannala-brandt":
@@ -262,7 +262,7 @@ def _arguments(sequence: Sequence, views: list[View], images: Images) -> dict[st
 
 
 def _gsplat_pixels(sequence: Sequence, view: View, points: Points) -> FloatArray:
-    """Pixels (n, 2) where gsplat's motion model sees the points."""
+    """Project points to pixels (n, 2) with the motion model of gsplat."""
     first, last = ends(sequence, view)
     lines = lines_of(sequence, view, points.pixels)
     share = (lines / max(sequence.shutter.lines(view.side) - 1, 1))[:, None]

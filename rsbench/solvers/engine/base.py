@@ -1,12 +1,12 @@
-"""The solver contract (correspondences in, one motion estimate out; no sampling, no files), and solvers by
-name.
+"""The interface of solvers (from correspondences to one motion estimate, without sampling or files), and loading
+solvers by name.
 
-A solver is a final, frozen dataclass below ``Solver``; its fields are the parameters that its card may set, and
-its ``spec`` declares what it needs and what it gives. A solver has no name: its card or entry point has
-(``SolverEntry``, see ``rsbench.components.plugins``). A solver that finds nothing returns a ``MotionEstimate``
-without success and with the reason: failure is never an exception and never an identity motion.
+A solver is a final, frozen dataclass derived from ``Solver``. Its fields are the parameters that its card may set,
+and its ``spec`` declares its inputs and outputs. The class itself has no name; its card or entry point names it
+(``SolverEntry``, see ``rsbench.components.plugins``). A solver that finds no motion returns a ``MotionEstimate``
+with ``success = False`` and a reason; it raises no exception and does not return the identity.
 
-The decorator ``solver`` makes such a class of a function that returns w and d.
+The decorator ``solver`` makes such a class from a function that returns w and d.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 MatchSet = Literal["left", "right", "stereo", "tracks", "affine", "gyro", "gravity"]
-"""Matches; affine frames of the left ones, a row each; and samples of other sensors, which are given whole and no
-part of RANSAC's samples."""
+"""Sets of matches, affine frames of the left matches (one row each), and samples of other sensors. The latter are
+not
+sampled by RANSAC: a solver always gets all of them."""
 SENSORS: Mapping[MatchSet, str] = {"gyro": "samples of a gyroscope", "gravity": "directions of gravity"}
-"""Samples of other sensors."""
+"""Sets of samples of other sensors."""
 Cameras = Literal["ideal", "lens", "any", "rig"]
 Robust = Literal["ransac", "own"]
 BESIDE: Mapping[MatchSet, str] = {"affine": "affine frames of left matches", **SENSORS}
@@ -55,7 +56,7 @@ class MotionEstimate:
     """(3,) translation of the solver's reference point; metres when ``metric``, else of arbitrary length."""
     success: bool
     reason: str = ""
-    """Why there is no estimate, or what the data leave open in a successful one; empty when nothing is."""
+    """Why there is no estimate or, after success, what the data do not determine; empty if they determine all."""
     metric: bool = False
     """Whether the length of ``d`` is known, in metres."""
     direction_known: bool = True
@@ -66,9 +67,9 @@ class MotionEstimate:
     The length of d from pairs alone is nearly Gaussian in ``1 / |d|`` rather than in ``|d|``.
     """
     noise_px: float | None = None
-    """Standard deviation of one pixel coordinate that the residuals show."""
+    """Standard deviation of one pixel coordinate, estimated from the residuals."""
     motion_parameters: Mapping[str, float] = field(default_factory=dict)
-    """The motion model's own parameters that the solver estimated; the spec has the others."""
+    """The motion model's own parameters that the solver estimated; the others are in the spec."""
 
     def __post_init__(self) -> None:
         for name in ("success", "metric", "direction_known"):
@@ -85,13 +86,13 @@ class MotionEstimate:
 
     @classmethod
     def failed(cls, reason: str) -> MotionEstimate:
-        """A failed estimate with its reason."""
+        """Return a failed estimate with its reason."""
         nowhere = np.full(3, np.nan)
         return cls(w=nowhere, d=nowhere, success=False, reason=reason, direction_known=False)
 
     @classmethod
     def of_one_camera(cls, w: FloatArray, d: FloatArray, **motion_parameters: float) -> MotionEstimate:
-        """The estimate of one camera, which leaves the length of d open; a failure where it is not finite."""
+        """Return an estimate from one camera, with d of unknown length; a failed one if w or d is not finite."""
         if not np.all(np.isfinite([*w, *d])):
             return cls.failed("no finite motion fits")
         reason = "the length of d is not determined by one camera"
@@ -100,34 +101,35 @@ class MotionEstimate:
 
 @dataclass(frozen=True, kw_only=True)
 class SolverSpec:
-    """What a solver declares, checked when it is made: data, which tables, cards and RANSAC read.
+    """A solver's declaration of its inputs and outputs, which tables, cards and RANSAC read.
 
-    Raises ValueError on a set, model, shutter or point that does not exist, so that a typing error cannot
+    The constructor raises ValueError for an unknown set, model, shutter or point, so that a typing error cannot
     change scores unnoticed.
     """
 
     needs: Set[MatchSet]
-    """Sets without which it cannot work; it may use others when they are there."""
+    """Sets that the solver requires; it may use others if they are given."""
     minimum: Mapping[MatchSet, int]
-    """Fewest matches in each set that it needs."""
+    """Smallest number of matches in each required set."""
     metric: bool
     """Whether it can give the length of d in metres."""
     motion_model: str
-    """Interpolation it assumes between the rows: the name of a motion model."""
+    """Name of the motion model that it assumes between the rows."""
     shutter: Literal["rolling", "global"]
     reference_point: Literal["body", "left"]
-    """The point of the rig whose translation ``d`` is."""
+    """The point of the rig whose translation is ``d``."""
     reference: str
-    """Where it was published: paper and equation."""
+    """Publication: paper and equations."""
     assumes: str
     """Its assumptions, in words."""
     cameras: Cameras = "ideal"
-    """Cameras that it supports besides equal aligned ones without a lens that read rows from the top at the same
-    times: a lens; also other scans and a late right camera; or any rig. It then gets times from
-    ``shutter.pixel_time`` alone and rays from ``camera.unproject`` or, for any rig, ``rig.eye(side).unproject``.
-    A global-shutter solver without ``rig`` gets the matches and the rig as an ideal rig would see them."""
+    """Cameras that it supports. ``ideal``: equal aligned cameras without a lens, which read rows from the top at
+    the same times; ``lens``: they may have a lens; ``any``: also other scans and a delayed right camera; ``rig``:
+    any rig. Unless ``ideal``, the solver must take times from ``shutter.pixel_time`` alone and rays from
+    ``camera.unproject`` or, for ``rig``, from ``rig.eye(side).unproject``. A global-shutter solver gets the
+    matches and the rig as an ideal rig would see them, unless it declares ``rig``."""
     motion_parameters: Mapping[str, Any] = field(default_factory=dict)
-    """The motion model's own parameters that it assumes; absent ones have the model's defaults."""
+    """Parameters of the motion model that it assumes; absent ones have the model's defaults."""
 
     def __post_init__(self) -> None:
         if not hasattr(self.needs, "__iter__") or not all(isinstance(each, str) for each in self.needs):
@@ -172,7 +174,7 @@ class SolverSpec:
             raise ValueError(str(error)) from error
 
     def refusal(self, rig: StereoRig, shutter: RollingShutter) -> str:
-        """Why it does not accept such cameras; empty when it does."""
+        """Return why the solver does not support these cameras; empty if it does."""
         if self.shutter == "global" or self.cameras == "rig":
             return ""
         if not rig.aligned:
@@ -186,7 +188,7 @@ class SolverSpec:
         return ""
 
     def shortage(self, counts: Mapping[MatchSet, int]) -> MotionEstimate | None:
-        """A failed estimate where there are too few matches; None when there are enough."""
+        """Return a failed estimate if there are too few matches, else None."""
         for name, least in self.minimum.items():
             if counts.get(name, 0) < least:
                 return MotionEstimate.failed(
@@ -196,36 +198,36 @@ class SolverSpec:
 
 
 class Solver(ABC):
-    """Relative pose of a stereo rig over one frame period."""
+    """Base class of solvers, which estimate the relative pose of a stereo rig over one frame period."""
 
     @property
     @abstractmethod
     def spec(self) -> SolverSpec:
-        """Its declaration; a class attribute where the parameters do not change it."""
+        """The solver's declaration; may be a class attribute if it does not depend on the parameters."""
 
     @property
     def inner_keys(self) -> tuple[str, ...]:
-        """Keys (``SolverEntry.key``) of the solvers inside this one: they are part of its identity."""
+        """Keys (``SolverEntry.key``) of solvers that this one calls; they become part of its own key."""
         return ()
 
     @abstractmethod
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        """Motion from all the given matches, which must be free of outliers."""
+        """Estimate the motion from all given matches, which must not contain outliers."""
 
     def sample_sizes(self, correspondences: Correspondences) -> Mapping[MatchSet, int]:
-        """Matches per set that ``propose`` wants in a minimal sample of these correspondences."""
+        """Return the number of matches of each set in a minimal sample for ``propose``."""
         return self.spec.minimum
 
     def propose(self, sample: Correspondences, rig: StereoRig, shutter: RollingShutter) -> list[MotionEstimate]:
-        """Motions that may explain a minimal sample; failures give the reason when nothing else is found."""
+        """Return candidate motions for a minimal sample, or failed estimates with the reason if there are none."""
         return [self.estimate(sample, rig, shutter)]
 
     def propose_all(
         self, samples: Sequence[Correspondences], rig: StereoRig, shutter: RollingShutter
     ) -> Iterable[list[MotionEstimate]]:
-        """``propose`` for each of several samples of equal sizes, for a solver that does many at once."""
+        """Call ``propose`` for several samples of equal size; solvers may override it to batch them."""
         return (self.propose(sample, rig, shutter) for sample in samples)
 
     def improve(
@@ -236,11 +238,11 @@ class Solver(ABC):
         shutter: RollingShutter,
         quick: bool = False,
     ) -> MotionEstimate:
-        """Like ``estimate``, for a solver that profits from a nearby start.
+        """Estimate the motion from inliers, starting from an approximate motion if the solver can use one.
 
         Args:
-            motion: where to start.
-            quick: a step of a search, whose result is refined again, so that few digits suffice.
+            motion: the starting point.
+            quick: whether low accuracy suffices, because the result is refined again later in the search.
         """
         return self.estimate(correspondences, rig, shutter)
 
@@ -252,18 +254,18 @@ class Solver(ABC):
         shutter: RollingShutter,
         noise_px: float,
     ) -> MotionEstimate | None:
-        """The end of a robust search, of a solver that weighs matches itself; None leaves it to ``improve``.
+        """Conclude a robust search, if the solver weights matches itself; None leaves it to ``improve``.
 
         Args:
-            motion: the best of the search.
-            correspondences: all matches near it, of which some are wrong, far more than ``improve`` is given.
-            noise_px: standard deviation of a coordinate that the search has found.
+            motion: the best motion of the search.
+            correspondences: all matches with residuals below a much larger threshold, including some outliers.
+            noise_px: standard deviation of a coordinate, as estimated by the search.
         """
         return None
 
 
 class _FunctionSolver(Solver):
-    """Calls a function, see ``solver``."""
+    """Solver that calls a function, see ``solver``."""
 
     function: ClassVar[Callable[..., Any]]
     card_options: ClassVar[SolverOptions]
@@ -272,7 +274,7 @@ class _FunctionSolver(Solver):
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
         given, spec = correspondences, self.spec
-        if not spec.needs & {"tracks", "stereo", "affine"}:  # the rows of the last two belong to those of left
+        if not spec.needs & {"tracks", "stereo", "affine"}:  # rows of these sets must keep matching those of left
             pairs = {side: temporal_pairs(given, side) for side in ("left", "right")}
             none = {name: getattr(given, name)[:0] for name in ("tracks", "covariance", "affine")}
             given = replace(given, **pairs, **none)
@@ -287,7 +289,7 @@ class _FunctionSolver(Solver):
         return self._estimate_of(found)
 
     def _estimate_of(self, found: object) -> MotionEstimate:
-        """Raises ValueError for what is no motion, a mistake in the function."""
+        """Convert the function's return value to an estimate; raise ValueError if it is not a motion or None."""
         if isinstance(found, MotionEstimate):
             return found
         if found is None:
@@ -363,28 +365,29 @@ def solver(
     code: str = "",
     tuned_on: str = "",
 ) -> Any:
-    """Make a solver of a function ``(correspondences, rig, shutter)`` that returns w and d, or None.
+    """Make a solver from a function ``(correspondences, rig, shutter)`` that returns w and d, or None.
 
-    It decorates the function, or is called with it, and leaves it as it is. Then ``FILE.py`` is a solver for
-    all commands, and the function one for ``estimate_motion``. Further parameters of the function have defaults; a
-    card may set them. Unless it needs tracks, links or affine frames, points tracked through all images are in
-    ``.left`` and ``.right`` like the others, and there are no ``.tracks``.
+    This can be used as a decorator or called with the function, which stays unchanged. All commands then accept
+    ``FILE.py`` as a solver, and ``estimate_motion`` accepts the function. Further parameters of the function must
+    have defaults; a card may set them. Unless ``needs`` contains tracks, stereo or affine, points tracked through
+    all images are in ``.left`` and ``.right`` like other matches, and ``.tracks`` is empty.
 
-    A failure is None, a number that is not finite, or a ``numpy.linalg.LinAlgError``. The function may return a
-    ``MotionEstimate`` too, such as one with a covariance.
+    The function fails if it returns None or a value that is not finite, or raises ``numpy.linalg.LinAlgError``. It
+    may also return a ``MotionEstimate``, for example one with a covariance.
 
     Args:
-        function: ``w`` (3,) rotation vector, rad, ``d`` (3,) translation of the reference point, both of one frame
-            period: ``X_body = exp([w]x) X_world + d``.
+        function: returns ``w`` (3,), the rotation vector in rad, and ``d`` (3,), the translation of the reference
+            point, both over one frame period: ``X_body = exp([w]x) X_world + d``.
         needs: the sets of matches that it uses.
-        minimum: fewest matches of each, or of each set by its name; RANSAC draws samples of this size. A number
-            is not for the samples of sensors, of which two are needed.
+        minimum: smallest number of matches in every set, or by name of the set; RANSAC draws samples of this size.
+        If
+            it is one number, it does not apply to samples of sensors, of which two are then needed.
         metric: whether d is in metres.
         motion_model, shutter, reference_point, cameras, reference: see ``SolverSpec``.
         robust, code, tuned_on: see ``SolverOptions``; a card may set them too.
 
     Raises:
-        ValueError: no function of three arguments, or an option out of its range.
+        ValueError: it is not a function of three arguments, or an option has an invalid value.
     """
     options: dict[str, Any] = {
         "metric": metric,
@@ -440,18 +443,18 @@ def solver(
 
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions:
-    """Keys of a solver's card beside its parameters."""
+    """Keys of a solver's card other than its parameters."""
 
     robust: Robust = "ransac"
     """``own``: the solver rejects outliers itself and gets all matches; ``ransac``: rsbench's loop does."""
     use: str = ""
     """When to choose this solver, one line for readers; no code uses it."""
     time_limit_s: float = 60.0
-    """Wall-clock time for one problem, after which a solver of another package has failed."""
+    """Wall-clock time limit for one problem; a solver of another package that exceeds it has failed."""
     code: str = ""
-    """Whose code finds the motion, if not rsbench's: package, version and licence, for boards."""
+    """External code that computes the motion, if any: package, version and licence, for leaderboards."""
     tuned_on: str = ""
-    """Data by which parameters of the method were chosen, and when, for boards; empty: not stated."""
+    """Data on which parameters of the method were tuned, and when, for leaderboards; empty: not stated."""
 
     def __post_init__(self) -> None:
         if self.robust not in get_args(Robust):
@@ -464,7 +467,7 @@ class SolverOptions:
 
     @property
     def deciding(self) -> dict[str, Any]:
-        """Options that may change an answer, by name."""
+        """Options that may change results, by name."""
         return {"robust": self.robust, "time_limit_s": self.time_limit_s}
 
 
@@ -484,7 +487,7 @@ SOLVERS: Kind[Solver, SolverOptions] = Kind(
 
 
 class SolverEntry(Entry[Solver, SolverOptions]):
-    """A solver under the name of its card or entry point: what tables rank."""
+    """A solver with the name of its card or entry point, as ranked in tables."""
 
     @property
     def solver(self) -> Solver:
@@ -493,24 +496,24 @@ class SolverEntry(Entry[Solver, SolverOptions]):
 
 
 def list_solvers() -> list[str]:
-    """Names of all solvers, sorted."""
+    """Return the names of all solvers, sorted."""
     return plugins.list_names(SOLVERS)
 
 
 def load_solver(name_or_path: str | Path) -> Solver:
-    """A solver by the name of a card or entry point, by the path of a card, or by ``FILE.py[:NAME]``.
+    """Load a solver by the name of a card or entry point, by the path of a card, or by ``FILE.py[:NAME]``.
 
     Raises:
-        RsbenchError: no such solver, two of that name, or its card, file or class is wrong.
+        RsbenchError: the solver does not exist, two solvers have this name, or its card, file or class is invalid.
     """
     return load_solver_entry(name_or_path_of("name_or_path", name_or_path)).solver
 
 
 def load_solver_entries(names_or_paths: Sequence[str]) -> list[SolverEntry]:
-    """Several solvers that go into one table.
+    """Load several solvers for one table.
 
     Raises:
-        RsbenchError: see ``load_solver``; or two of them have the same name.
+        RsbenchError: see ``load_solver``; also if two of them have the same name.
     """
     entries: dict[str, SolverEntry] = {}
     given: dict[str, str] = {}
@@ -526,15 +529,17 @@ def load_solver_entries(names_or_paths: Sequence[str]) -> list[SolverEntry]:
 
 
 def load_solver_entry(name_or_path: str | Path) -> SolverEntry:
-    """Like ``load_solver``, with its name, its card's options and its key."""
+    """Load a solver like ``load_solver``, together with its name, its card's options and its key."""
     return SolverEntry(**vars(plugins.load_entry(SOLVERS, name_or_path)))
 
 
 def entry_of(solver: str | Path | Solver | Callable[..., Any]) -> SolverEntry:
-    """The entry of a solver by its name, the path of its card or file, or itself, which its class then names.
+    """Return the entry of a solver, given its name, the path of its card or file, or the solver itself.
+
+    A solver object, class or decorated function gets the name of its class.
 
     Raises:
-        ValueError: it is none of them.
+        ValueError: it is none of these.
     """
     if isinstance(solver, str | Path):
         return load_solver_entry(solver)

@@ -1,8 +1,8 @@
-"""Compiled inner loops of one camera with free velocities in both frames; see ``solvers.free_velocities``.
+"""Compiled inner loops for one camera with independent velocities in both frames; see ``solvers.free_velocities``.
 
-A motion is R (3, 3) and
-vectors (5, 3): t, v0, v1, w0, w1. The unknowns of a descent, 11 or 17, are a turn left of R, two steps of t on
-the unit sphere, v1 - R v0 and (v1 + R v0) / 2, and the same of w0 and w1.
+A motion consists of R (3, 3) and vectors (5, 3) with rows t, v0, v1, w0, w1. The 11 or 17 unknowns of a descent
+are a rotation that multiplies R from the left, two steps of t on the unit sphere, changes of v1 - R v0 and of (v1
++ R v0) / 2 and, if there are 17, the same for w0 and w1.
 """
 
 from __future__ import annotations
@@ -27,26 +27,27 @@ from rsbench.components.motion_kernels import (
 from rsbench.core.so3 import FloatArray
 
 Match = tuple[Vector, Vector, float, float]
-"""Rays of frame 0 and 1, z = 1, and their s."""
+"""Rays of frames 0 and 1, z = 1, and their times s0, s1."""
 Target = tuple[FloatArray, FloatArray, float, FloatArray, NDArray[np.int64]]
-"""What a descent minimises: rows (n, 6), focal (2,) and slowness of Sampson errors; or F and the ``places`` of its
-coefficients, where F is not empty."""
+"""Data of the cost of a descent: rows (n, 6), focal (2,) and slowness for ``_sampson``, then F and ``places`` for
+``_misfit``, which is minimised if F is not empty."""
 
 
 @compiled
 def free_terms(
     R: FloatArray, vectors: FloatArray, rows: FloatArray, focal: FloatArray, residuals: FloatArray, J: FloatArray
 ) -> None:
-    """Sampson errors, px, and what makes J^T times them the gradient of half their squares.
+    """Fill Sampson errors, px, and J such that J^T times the errors is the gradient of half their squares.
 
-    The constraint y^T [T]x R x over the length of its derivative by the pixels, with that derivative at the
-    corrected measurement: see ``residuals``.
+    The error is the constraint y^T [T]x R x divided by the norm of its derivative by the pixels. J is evaluated at
+    the corrected measurement: see ``residuals``.
 
     Args:
         R: (3, 3); vectors: (5, 3) t, v0, v1, w0, w1.
         rows: (n, 6) ray 0 (x, y), ray 1 (x, y), s0, s1; focal: (2,) fx, fy in pixels.
         residuals: (n,), filled.
-        J: (n, 18), filled, by ``FreeMotion.moved``; of no rows to leave it out.
+        J: (n, 18), filled with derivatives by the step of ``FreeMotion.moved``; if it has no rows, it is not
+            computed.
     """
     work = np.zeros((4, 3, 3))
     for m in range(len(rows)):
@@ -86,7 +87,7 @@ def _left_jacobian(phi: Vector, out: FloatArray) -> None:
 
 @compiled
 def _between(R: FloatArray, vectors: FloatArray, s0: float, s1: float, work: FloatArray) -> tuple[Vector, Vector]:
-    """T and R(s0, s1) v0; ``work`` is filled with the rotations of frame 0 and 1 and R(s0, s1)."""
+    """Return T and R(s0, s1) v0; fill ``work`` with exp(-s0 w0), exp(s1 w1) and R(s0, s1)."""
     A0, A1, P = work[0], work[1], work[2]
     v0, v1 = _row(vectors, 1), _row(vectors, 2)
     exponential(times(-s0, _row(vectors, 3)), A0)
@@ -107,7 +108,7 @@ def _between(R: FloatArray, vectors: FloatArray, s0: float, s1: float, work: Flo
 def _constraint(
     R: FloatArray, vectors: FloatArray, match: Match, focal: FloatArray, work: FloatArray
 ) -> tuple[float, tuple[float, float, float, float]]:
-    """y^T [T]x R x and its derivatives by the pixels: a row that moves is another pose too."""
+    """Return y^T [T]x R x and its derivatives by x0, y0, x1, y1; a change of row changes the pose too."""
     (x, y, s0, s1), A1, P = match, work[1], work[2]
     T, Rv0 = _between(R, vectors, s0, s1, work)
     v1, w1 = _row(vectors, 2), _row(vectors, 4)
@@ -129,12 +130,12 @@ def _constraint(
 
 @compiled
 def _derivatives(R: FloatArray, vectors: FloatArray, match: Match, work: FloatArray, J: FloatArray) -> None:
-    """Derivatives (18,) of the constraint by turn, t, v0, v1, w0 and w1."""
+    """Fill J (18,) with derivatives of the constraint by a rotation from the left, t, v0, v1, w0 and w1."""
     (x, y, s0, s1), A1, P, S = match, work[1], work[2], work[3]
     T, Rv0 = _between(R, vectors, s0, s1, work)
     p = apply(P, x)
     n = cross(p, y)
-    turned = plus(plus(times(dot(T, p), y), -dot(y, p), T), -s0, cross(Rv0, n))  # by a turn left of R(s0, s1)
+    turned = plus(plus(times(dot(T, p), y), -dot(y, p), T), -s0, cross(Rv0, n))  # by a rotation left of R(s0, s1)
     by_R = apply_transposed(A1, turned)
     _left_jacobian(times(-s0, _row(vectors, 3)), S)
     by_w0 = apply_transposed(S, apply_transposed(R, by_R))
@@ -148,7 +149,7 @@ def _derivatives(R: FloatArray, vectors: FloatArray, match: Match, work: FloatAr
 
 @compiled
 def free_in_front(R: FloatArray, vectors: FloatArray, rows: FloatArray) -> int:
-    """How many points lie in front of both cameras; T counts on the side of t."""
+    """Count the points in front of both cameras, with the sign of T chosen so that T . t >= 0."""
     work, t = np.zeros((3, 3, 3)), _row(vectors, 0)
     count = 0
     for m in range(len(rows)):
@@ -165,12 +166,12 @@ def free_in_front(R: FloatArray, vectors: FloatArray, rows: FloatArray) -> int:
 
 @compiled
 def free_from_row(R: FloatArray, vectors: FloatArray, s: float, out_R: FloatArray, out: FloatArray) -> None:
-    """``free_velocities.from_row``: the motion with s = 0 at another row, filled."""
+    """Fill the same motion with s = 0 at another row, as ``free_velocities.from_row``."""
     work = np.zeros((3, 3, 3))
     v0, v1, w0, w1 = _row(vectors, 1), _row(vectors, 2), _row(vectors, 3), _row(vectors, 4)
     t, Rv0 = _between(R, vectors, s, s, work)
     _copy(work[2], out_R)
-    # Frame 0 began at (exp(s w0), s v0); its camera is the world now.
+    # The camera of frame 0 at time s, (exp(s w0), s v0), becomes the new reference.
     v0, v1 = plus(v0, -s, cross(w0, v0)), plus(v1, -s, cross(w1, Rv0))
     for k in range(3):
         out[0, k], out[1, k], out[2, k], out[3, k], out[4, k] = t[k], v0[k], v1[k], w0[k], w1[k]
@@ -180,7 +181,12 @@ def free_from_row(R: FloatArray, vectors: FloatArray, s: float, out_R: FloatArra
 def fill_coefficients(
     R: FloatArray, vectors: FloatArray, place: NDArray[np.int64], out: FloatArray, by: FloatArray
 ) -> None:
-    """``coefficients`` of a motion, vectors (5, 3) t, v0, v1, w0, w1; into zeros, place is ``places``."""
+    """Fill the ``coefficients`` of a motion and their derivatives.
+
+    Args:
+        vectors: (5, 3) t, v0, v1, w0, w1; place: the index array ``places``.
+        out, by: (21,) or (45,) coefficients and derivatives (18, 21 or 45), both zero before the call.
+    """
     degree = (len(place) - 3) // 2
     t, v0, v1, w0, w1 = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
     Q, zero, unit = np.zeros((2, 2, 3, 3)), np.zeros(3), np.zeros(3)
@@ -211,9 +217,9 @@ def fill_coefficients(
 def _turned_products(
     R: FloatArray, w0: FloatArray, w1: FloatArray, still: float, by0: float, by1: float, degree: int, Q: FloatArray
 ) -> None:
-    """Q[a, b]: what (I + s1 [w1]x) R (I - s0 [w0]x) has by s1^a s0^b, the terms without w0 and w1 times ``still``.
+    """Fill Q[a, b] with the coefficient of s1^a s0^b in (I + s1 [w1]x) R (I - s0 [w0]x).
 
-    ``by0`` and ``by1`` are factors of those with w0 alone and with w1 alone.
+    ``still``, ``by0`` and ``by1`` multiply the term R, the term with w0 alone and the term with w1 alone.
     """
     Q[:] = 0.0
     for i in range(3):
@@ -245,7 +251,7 @@ def _form(
     place: NDArray[np.int64],
     out: FloatArray,
 ) -> None:
-    """Coefficients of [t + s1 v1]x Q - Q [s0 v0]x, added."""
+    """Add the coefficients of [t + s1 v1]x Q - Q [s0 v0]x to ``out``."""
     for a in range(degree):
         for b in range(degree):
             for i in range(3):
@@ -263,24 +269,25 @@ def _form(
 def _add_coefficient(
     out: FloatArray, place: NDArray[np.int64], degree: int, i: int, j: int, a: int, b: int, value: float
 ) -> None:
-    """To the coefficient of entry i of frame 1 times s1^a and entry j of frame 0 times s0^b."""
+    """Add to the coefficient of (ray 1)_i s1^a (ray 0)_j s0^b."""
     row = a if i == 0 else degree + (2 if i == 1 else 1) + a
     column = b if j == 0 else degree + (2 if j == 1 else 1) + b
     out[place[row, column]] += value
 
 
 _FLAT = 1e-9
-"""Relative decrease at which to stop: sqrt(n 1e-9) standard deviations from the end."""
+"""Relative decrease of the cost at which to stop, about sqrt(n 1e-9) standard deviations from the minimum."""
 _LARGEST_DAMPING = 1e8
 
 
 @compiled
 def descend(R: FloatArray, vectors: FloatArray, unknowns: int, most: int, exact: float, target: Target) -> float:
-    """Levenberg and Marquardt's descent, in place; what is left of the cost.
+    """Minimise the cost of ``target`` by Levenberg-Marquardt, changing R and vectors in place; return the final
+    cost.
 
     Args:
-        most: evaluations; exact: a cost that is as good as 0.
-        target: of ``_sampson``, or of ``_misfit`` when its F is not empty.
+        unknowns: 17, or 11 without rotation within the frames.
+        most: largest number of steps tried; exact: cost at which to stop.
     """
     trial_R, trial = np.zeros((3, 3)), np.zeros((5, 3))
     H, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
@@ -320,7 +327,7 @@ def _copy(source: FloatArray, target: FloatArray) -> None:
 
 @compiled
 def _evaluate(R: FloatArray, vectors: FloatArray, target: Target, H: FloatArray, gradient: FloatArray) -> float:
-    """The cost; H and gradient are filled."""
+    """Return the cost; fill H and gradient."""
     for i in range(len(H)):
         gradient[i] = 0.0
         for j in range(len(H)):
@@ -337,7 +344,7 @@ def _evaluate(R: FloatArray, vectors: FloatArray, target: Target, H: FloatArray,
 
 @compiled
 def _add(J: FloatArray, r: float, H: FloatArray, gradient: FloatArray) -> None:
-    """One residual to the upper half of the normal equations."""
+    """Add one residual r to the upper half of the normal equations."""
     for i in range(len(H)):
         gradient[i] += J[i] * r
         for j in range(i, len(H)):
@@ -346,7 +353,7 @@ def _add(J: FloatArray, r: float, H: FloatArray, gradient: FloatArray) -> None:
 
 @compiled
 def _sampson(R: FloatArray, vectors: FloatArray, target: Target, H: FloatArray, gradient: FloatArray) -> float:
-    """C (1 + slowness (|v0|^2 + |v1|^2)), C the sum of squared Sampson errors, px^2, of rows (n, 6)."""
+    """Return C (1 + slowness (|v0|^2 + |v1|^2)), where C is the sum of squared Sampson errors, px^2."""
     rows, focal, slowness, _, _ = target
     residuals, J, across, row = np.zeros(len(rows)), np.zeros((len(rows), 18)), _across(vectors), np.zeros(17)
     free_terms(R, vectors, rows, focal, residuals, J)
@@ -373,7 +380,7 @@ def _sampson(R: FloatArray, vectors: FloatArray, target: Target, H: FloatArray, 
 
 @compiled
 def _misfit(R: FloatArray, vectors: FloatArray, target: Target, H: FloatArray, gradient: FloatArray) -> float:
-    """Square of what the unit coefficients of a motion have across the unit vector F."""
+    """Return the squared component, orthogonal to the unit vector F, of the motion's unit coefficients."""
     F, place = target[3], target[4]
     n, across, row = len(F), _across(vectors), np.zeros(18)
     C, by, J = np.zeros(n), np.zeros((18, n)), np.zeros((n, 17))
@@ -404,7 +411,7 @@ def _misfit(R: FloatArray, vectors: FloatArray, target: Target, H: FloatArray, g
 
 @compiled
 def _across(vectors: FloatArray) -> tuple[Vector, Vector]:
-    """Two unit vectors across t and each other."""
+    """Return two unit vectors orthogonal to t, which has unit length, and to each other."""
     t = (vectors[0, 0], vectors[0, 1], vectors[0, 2])
     axis = (1.0, 0.0, 0.0) if abs(t[0]) < 0.7 else (0.0, 1.0, 0.0)
     first = cross(t, axis)
@@ -414,7 +421,7 @@ def _across(vectors: FloatArray) -> tuple[Vector, Vector]:
 
 @compiled
 def _by_unknowns(J: FloatArray, R: FloatArray, across: tuple[Vector, Vector], out: FloatArray) -> None:
-    """Derivatives (17,) by the unknowns from those (18,) by ``FreeMotion.moved``."""
+    """Fill derivatives (17,) by the unknowns from derivatives (18,) by the step of ``FreeMotion.moved``."""
     for k in range(3):
         out[k] = J[k]
     for k in range(2):
@@ -428,7 +435,7 @@ def _by_unknowns(J: FloatArray, R: FloatArray, across: tuple[Vector, Vector], ou
 
 @compiled
 def _move(R: FloatArray, vectors: FloatArray, step: FloatArray, out_R: FloatArray, out: FloatArray) -> None:
-    """The motion after a step of the unknowns."""
+    """Fill the motion after a step of the unknowns."""
     across, A = _across(vectors), np.zeros((3, 3))
     for k in range(3):
         out[0, k] = vectors[0, k] + step[3] * across[0][k] + step[4] * across[1][k]
@@ -450,7 +457,7 @@ def _move(R: FloatArray, vectors: FloatArray, step: FloatArray, out_R: FloatArra
 
 @compiled
 def _unit_length(vectors: FloatArray) -> None:
-    """t to length 1, with the velocities."""
+    """Divide t, v0 and v1 by |t|."""
     t = (vectors[0, 0], vectors[0, 1], vectors[0, 2])
     length = max(math.sqrt(dot(t, t)), 1e-300)
     for i in range(3):
@@ -460,7 +467,7 @@ def _unit_length(vectors: FloatArray) -> None:
 
 @compiled
 def _damped_step(H: FloatArray, gradient: FloatArray, damping: float, step: FloatArray) -> bool:
-    """Solve (H + damping diag H) step = -gradient, each unknown in its own unit; False where rounding forbids."""
+    """Solve (H + damping diag H) step = -gradient by scaled Cholesky; False if not positive definite."""
     n = len(H)
     unit, L = np.zeros(n), np.zeros((n, n))
     for i in range(n):
@@ -508,14 +515,15 @@ def free_proposal(
     R: FloatArray,
     out: FloatArray,
 ) -> None:
-    """R (3, 3) and vectors (5, 3) of a camera that does not turn within a frame, filled; most points in front.
+    """Fill R (3, 3) and out (5, 3), the motion of a sample for a camera that does not rotate within a frame.
 
     Args:
-        Rs, vectors: (2, 3, 3), (2, 5, 3) where to descend from to the unit coefficients (21,) F.
-        rows: (n, 6) with s = 0 at the principal point's row; ``first`` is that of the first row, which the motion
-            starts from.
-        slowness: of ``_sampson``.
-        most: evaluations of the descents to F, and of that of the Sampson errors, from no velocities; 0: none.
+        Rs, vectors: (2, 3, 3), (2, 5, 3) two starts, each refined in place towards the unit coefficients (21,) F.
+        rows: (n, 6) with s = 0 at the principal point's row.
+        first: s of the first row, at which the filled motion has s = 0.
+        slowness: see ``_sampson``.
+        most: largest number of steps of each descent towards F, and of the final one on Sampson errors, which
+            starts with zero velocities; 0 leaves it out.
     """
     near_R, near = np.zeros((4, 3, 3)), np.zeros((4, 5, 3))
     for k in range(2):
@@ -540,7 +548,7 @@ def free_proposal(
 
 @compiled
 def _with_twin(R: FloatArray, vectors: FloatArray, out_R: FloatArray, out: FloatArray) -> None:
-    """A motion and, by half a turn about its t, ``FreeMotion.twin``, filled."""
+    """Fill a motion and its ``FreeMotion.twin``, which is rotated by 180 degrees about t."""
     for i in range(3):
         for j in range(3):
             out_R[0, i, j], out_R[1, i, j] = R[i, j], -R[i, j]
@@ -554,7 +562,10 @@ def _with_twin(R: FloatArray, vectors: FloatArray, out_R: FloatArray, out: Float
 
 @compiled
 def _most_likely(Rs: FloatArray, vectors: FloatArray, rows: FloatArray, focal: FloatArray) -> int:
-    """Which motion has the least errors of those with more than half as many points in front as any has."""
+    """Return the index of the motion with the least Sampson error among those with enough points in front.
+
+    At least half as many points as for the best motion must lie in front of the cameras.
+    """
     n = len(Rs)
     front, r, J = np.zeros(n, dtype=np.int64), np.zeros(len(rows)), np.zeros((0, 18))
     for k in range(n):

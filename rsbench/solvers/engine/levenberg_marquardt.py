@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for six parameters (w, v), and for any problem that computes its own damped steps."""
+"""Levenberg-Marquardt for six parameters (w, v), and for other problems that compute their own damped steps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Place = TypeVar("Place")
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray, FloatArray]]
 _LARGEST_DAMPING = 1e10
 _FLAT = 1e-10
-"""Relative decrease of the cost at which to stop: the distance to the minimum is then sqrt(n 1e-10) deviations."""
+"""Relative decrease of the cost at which to stop, about sqrt(n 1e-10) standard deviations from the minimum."""
 
 
 class Minimum(NamedTuple):
@@ -70,7 +70,7 @@ def levenberg_marquardt(
 def _trial(
     theta: FloatArray, gradient: FloatArray, H: FloatArray, damping: float, limit: float, inverse_length: bool
 ) -> FloatArray:
-    """The parameters after a damped step."""
+    """Return the parameters after a damped step."""
     length = float(np.linalg.norm(theta[3:]))
     if not inverse_length or length == 0.0:
         return _clamped(theta + _damped_step(H, gradient, damping), limit)
@@ -94,7 +94,7 @@ def _damped_step(H: FloatArray, gradient: FloatArray, damping: float) -> FloatAr
 
 
 def _chart(v: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
-    """Axes (3, 3) along and across v; derivatives (6, 6) of (w, v) by w, 1 / |v| and two angles."""
+    """Return axes (3, 3) along and across v, and derivatives (6, 6) of (w, v) by w, 1 / |v| and two angles."""
     # The Householder reflection that maps the first axis to v / |v|, up to sign.
     sign = 1.0 if v[0] >= 0.0 else -1.0
     h = v / length
@@ -113,29 +113,29 @@ def _clamped(theta: FloatArray, limit: float) -> FloatArray:
 
 
 class Problem(Protocol[Place]):
-    """A cost to minimise; a place has parameters, and the cost and its derivatives there."""
+    """Interface to a cost function; a ``Place`` holds parameters and the cost with its derivatives at them."""
 
     def stepped(self, here: Place, damping: float, /) -> Place | None:
-        """The place after a damped step; None if its cost is not lower."""
+        """Return the place after a damped step; None if its cost is not lower."""
 
     def settled(self, before: Place, after: Place, /) -> bool:
-        """Whether the descent has converged with this step."""
+        """Return whether the descent has converged with this step."""
 
 
 class Damping(NamedTuple):
-    """Limits of the damping, which is multiplied by ten after a rejected step and divided by ten after others."""
+    """Limits of the damping, which is multiplied by ten after a rejected step and divided by ten otherwise."""
 
     least: float
     first: float
-    """Least damping after a rejected step."""
+    """Smallest damping after a rejected step."""
     largest: float
-    """The descent ends if no step with a smaller damping is accepted."""
+    """The descent ends if no step with less damping than this is accepted."""
     dropped: float = 0.0
     """A damping up to this becomes ``least`` after an accepted step."""
 
 
 def descend(problem: Problem[Place], here: Place, steps: int, damping: Damping) -> Place:
-    """Take at most ``steps`` accepted damped steps from a place."""
+    """Minimise from a starting place with at most ``steps`` accepted steps."""
     now = damping.least
     for _ in range(steps):
         there = None

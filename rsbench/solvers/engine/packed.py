@@ -1,25 +1,27 @@
-"""Correspondences in the form of the compiled residuals, with normal or heavy-tailed errors, and samples of
-tracks.
+"""Correspondences as arrays for the compiled residuals, models of their errors (normal or heavy-tailed), and
+motions from minimal samples of tracks.
 
-Rays are normalised, and each measurement occurs once.
+Rays are normalised (z = 1), and each measurement occurs once.
 
-Features of noisy images err by some tenths of a pixel, and one in a hundred by more than a pixel. Under a t
-distribution of nu degrees of freedom and scale s a measurement of p residuals and squared error q has the weight
+Feature positions in noisy images have errors of some tenths of a pixel, and about one in a hundred has more than a
+pixel. If the errors follow a t distribution with nu degrees of freedom and scale s, a measurement with p residuals
+and squared error q has the weight
 
     w = (nu + p) / (nu + q / s^2),
 
-so that outliers have little weight, without a threshold. s and nu maximise the likelihood. K. Lange, R. Little, J.
+so that outliers get little weight without a threshold. s and nu maximise the likelihood. K. Lange, R. Little, J.
 Taylor, Robust statistical modeling using the t distribution, JASA 1989.
 
-The weight does not detect a wrong match that changes the motion until its own residual vanishes. Its leverage
-does, its share of the information of all measurements (6 in sum); with a bounded leverage the residual remains
-(Mallows weights; P. Huber, Robust Statistics, 1981, 7.2: leverages up to 0.2 are safe).
+This weight does not detect an outlier that pulls the motion so far that its own residual vanishes. Such a match
+has a large leverage, i.e. share of the information of all measurements (the leverages sum to 6). If the leverage
+is bounded, its residual remains large (Mallows weights; P. Huber, Robust Statistics, 1981, 7.2: up to 0.2 is
+safe).
 
-Wrong matches that lie within ten scales by chance are no tail of that distribution: they would bias its estimate
-and the motion. Errors are therefore a mixture of the t distribution and a uniform one over the ball of ten scales,
-whose share is estimated with them (EM: A. Dempster, N. Laird, D. Rubin, J. Royal Statistical Society B 1977;
-uniform outliers: P. Torr, A. Zisserman, MLESAC, 2000). A measurement is weighted by the probability that it is
-right.
+Outliers that lie within ten scales by chance do not belong to the tail of the t distribution and would bias both
+its parameters and the motion. The errors are therefore modelled as a mixture of the t distribution and a uniform
+one over the ball of ten scales; their proportion is estimated too (EM: A. Dempster, N. Laird, D. Rubin, J. Royal
+Statistical Society B 1977; uniform outliers: P. Torr, A. Zisserman, MLESAC, 2000). Each measurement is weighted by
+its probability of being an inlier.
 """
 
 from __future__ import annotations
@@ -50,28 +52,29 @@ class Packed:
     """Measurements of one problem."""
 
     pairs: FloatArray
-    """(n, 7) or (n, 17), see ``kernels.pair_terms``."""
+    """(n, 7) or (n, 17), see ``residuals.pair_terms``."""
     tracks: FloatArray
     """(m, 8), see ``residuals.track_terms``, or (m, 4, 9), see ``residuals.timed_track_terms``."""
     row_checks: FloatArray
-    """(m,) squared row differences within the stereo pairs of the tracks: px^2, chi-squared with 2 degrees; 0 for
-    tracks (m, 4, 9), whose errors include them."""
+    """(m,) squared row differences within the stereo pairs of each track, px^2: chi-squared with 2 degrees of
+    freedom. They are 0 for tracks (m, 4, 9), whose errors already include them."""
     focal: FloatArray
     h: float
     baseline: float
     kernel: MotionKernel
     """The kernel of the motion model."""
     apart: bool = False
-    """Whether descents begin at ``at_once``, since the two ends of stereo pairs have very different times."""
+    """Whether descents start from the solution of ``at_once``, because the two ends of stereo pairs are read at
+    very different times."""
 
     @property
     def law(self) -> MotionKernel:
-        """The kernel for the compiled residuals."""
+        """The kernel in the form that the compiled residuals take."""
         return quick_law(self.kernel)
 
     @property
     def freedom(self) -> FloatArray:
-        """(n + m,) residuals of each measurement, p."""
+        """Number p of residuals of each measurement, (n + m,)."""
         return np.repeat([float(_PAIR_FREEDOM), float(TRACK_FREEDOM)], [len(self.pairs), len(self.tracks)])
 
     @property
@@ -81,7 +84,7 @@ class Packed:
 
     @property
     def one_camera(self) -> bool:
-        """Whether all are pairs of a camera in the body's origin, which do not determine the length of v."""
+        """Whether all measurements are pairs of one camera at the body's origin; these do not determine |v|."""
         return len(self.tracks) == 0 and not np.any(self.pairs[:, 6])
 
     @property
@@ -90,9 +93,9 @@ class Packed:
         return 5 if self.one_camera else 6
 
     def definite(self, theta: FloatArray, H: FloatArray) -> FloatArray:
-        """H (6, 6), made definite along the length of v where the pairs do not determine it; steps stay the same.
+        """Return H (6, 6), made positive definite along v if the pairs do not determine |v|; steps do not change.
 
-        For kernels whose T is proportional to v, as of all motion models here.
+        This assumes a kernel whose T is proportional to v, as for all motion models of rsbench.
         """
         length = float(np.linalg.norm(theta[3:]))
         if not self.one_camera or length == 0.0:
@@ -102,24 +105,25 @@ class Packed:
         return out
 
     def pair_counts(self) -> dict[Side, int]:
-        """Pairs of either camera."""
+        """Return the number of pairs of each camera."""
         left = int(np.count_nonzero(self.pairs[:, 6] >= 0.0))
         return {"left": left, "right": len(self.pairs) - left}
 
     def larger_side(self) -> FloatArray:
-        """The pairs (n, 7) of the camera that has more of them."""
+        """Return the pairs (n, 7) or (n, 17) of the camera that has more of them."""
         left = self.pairs[:, 6] >= 0.0
         return self.pairs[left if 2 * np.count_nonzero(left) >= len(left) else ~left]
 
     def subset(self, most: int) -> Packed:
-        """At most about ``most`` evenly chosen pairs and tracks, for choosing among starts."""
+        """Return about ``most`` evenly spaced pairs and as many tracks, for choosing among starting points."""
         step_p, step_t = max(1, len(self.pairs) // most), max(1, len(self.tracks) // most)
         return self._of(self.pairs[::step_p], self.tracks[::step_t], self.row_checks[::step_t])
 
     def at_once(self) -> Packed:
-        """The ends of the right camera where it would have seen them when the left one did, to first order.
+        """Shift the right camera's ends to where it would see them at the left one's times, to first order.
 
-        At zero motion the original ends give no depth, if points move by more than a disparity in between.
+        Without this, a descent from zero motion finds no depth if points move by more than their disparity between
+        the two readouts.
         """
         tracks = self.tracks.copy()
         left, right = tracks[:, ::2], tracks[:, 1::2]
@@ -130,18 +134,18 @@ class Packed:
         return replace(self, tracks=tracks)
 
     def only(self, wanted: BoolArray) -> Packed:
-        """The pairs and then the tracks of a mask (n + m,)."""
+        """Select measurements by a mask (n + m,) over the pairs followed by the tracks."""
         pairs, tracks = np.split(wanted, [len(self.pairs)])
         return self._of(self.pairs[pairs], self.tracks[tracks], self.row_checks[tracks])
 
     def _of(self, pairs: FloatArray, tracks: FloatArray, row_checks: FloatArray) -> Packed:
-        # Contiguous: other arrays would need another compilation of the kernels.
+        # The arrays must be contiguous: for others, the kernels would be compiled once more.
         same = {name: getattr(self, name) for name in ("focal", "h", "baseline", "kernel", "apart")}
         pairs, tracks = np.ascontiguousarray(pairs), np.ascontiguousarray(tracks)
         return Packed(pairs=pairs, tracks=tracks, row_checks=row_checks, **same)
 
     def normal_equations(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Half the sum of squares in px^2, its gradient (6,) and Gauss-Newton Hessian (6, 6)."""
+        """Return half the sum of squares in px^2, its gradient (6,) and Gauss-Newton Hessian (6, 6)."""
         residuals, squares = np.zeros(len(self.pairs)), np.zeros(len(self.tracks))
         H, gradient = np.zeros((6, 6)), np.zeros(6)
         pair_terms(theta, self.law, self.pairs, self.focal, self.h, residuals, H, gradient, True)
@@ -149,28 +153,28 @@ class Packed:
         return 0.5 * float(residuals @ residuals + np.sum(squares)), gradient, self.definite(theta, H)
 
     def pair_residuals(self, theta: FloatArray) -> FloatArray:
-        """Sampson errors (n,) of the pairs, px."""
+        """Return the Sampson errors (n,) of the pairs, px."""
         residuals, unused = np.zeros(len(self.pairs)), (np.zeros((6, 6)), np.zeros(6))
         pair_terms(theta, self.law, self.pairs, self.focal, self.h, residuals, *unused, False)
         return residuals
 
     def track_squares(self, theta: FloatArray) -> FloatArray:
-        """Squared whitened errors (m,) of the tracks with their row checks, px^2, 5 degrees of freedom."""
+        """Return squared whitened errors (m,) of the tracks, row checks included: px^2, 5 degrees of freedom."""
         squares, unused = np.zeros(len(self.tracks)), (np.zeros((6, 6)), np.zeros(6))
         track_terms(theta, self.law, self.tracks, self.focal, self.h, self.baseline, squares, *unused, False)
         return np.where(squares >= BEHIND, BEHIND, squares + self.row_checks)
 
     def pair_costs(self, theta: FloatArray) -> FloatArray:
-        """Twice what each of the pairs (n,) adds to the cost, px^2."""
+        """Return twice the contribution of each pair (n,) to the cost, px^2."""
         return self.pair_residuals(theta) ** 2
 
     def noise_variance(self, cost: float) -> float:
-        """Variance (px^2) of a coordinate that the residuals show; 0 without more equations than unknowns."""
+        """Estimate the variance (px^2) of a coordinate from the cost; 0 without more equations than unknowns."""
         freedom = self.constraints - self.parameters
         return 2.0 * cost / freedom if freedom > 0 else 0.0
 
     def stated(self, theta: FloatArray, cost: float, H: FloatArray) -> Stated | None:
-        """Covariance (6, 6) of theta at the minimum, see ``core.uncertainty``; None when it does not exist."""
+        """Return the covariance (6, 6) of theta at the minimum, see ``core.uncertainty``; None if undefined."""
         inverse, variance = inverse_definite(H), self.noise_variance(cost)
         if inverse is None or self.constraints <= self.parameters:
             return None
@@ -188,7 +192,7 @@ class Packed:
         information: FloatArray,
         variance: float,
     ) -> Stated:
-        """``stated_covariance`` of the measurements, of this ``variance`` (px^2), at their places in frame 0."""
+        """Call ``stated_covariance`` with this ``variance`` (px^2); measurements lie at their rays in frame 0."""
         tracks = self.tracks[:, :2] if self.tracks.ndim == 2 else self.tracks[:, 0, :2]
         moved = list[FloatArray]()
         for shifted in self.shifted(_SHIFT_STEP_PX):
@@ -207,9 +211,9 @@ class Packed:
         )
 
     def shifted(self, px: float) -> Iterator[Packed]:
-        """The measurements with the right ends of frame 0 shifted, with those of frame 1, with all of frame 1.
+        """Yield the measurements with some ends shifted: right ones of frame 0, of frame 1, or all of frame 1.
 
-        Each along x and along y, where the measurements depend on it.
+        They are shifted along x and then along y; a shift on which no measurement depends is left out.
         """
         timed, step = self.tracks.ndim == 3 or self.pairs.shape[1] == 17, px * np.eye(2)
         for ends, axis in product(((1,), (3,), (2, 3)), range(2)):
@@ -223,7 +227,7 @@ class Packed:
                     tracks[:, end, :2] += tracks[:, end, 3:7].reshape(-1, 2, 2) @ step[axis] / self.focal
             elif 2 in ends:
                 tracks[:, 3 + axis] += px
-            elif axis == 1:  # one row of both images
+            elif axis == 1:  # both images have one row in common
                 continue
             elif ends == (1,):
                 tracks[:, 0] += 0.5 * px / self.focal[0]
@@ -234,29 +238,29 @@ class Packed:
             yield replace(self, pairs=pairs, tracks=tracks)
 
     def in_front(self, theta: FloatArray) -> int:
-        """Number of pairs whose point lies in front of both cameras."""
+        """Count the pairs whose point lies in front of both cameras."""
         return count_in_front(theta, self.law, self.pairs)
 
     def signed(self, w: FloatArray, d: FloatArray) -> FloatArray:
-        """d or -d (3,), whichever has more pairs in front of the cameras."""
+        """Return d or -d (3,), whichever puts more pairs in front of the cameras."""
         front, back = (self.in_front(self.theta(w, each)) for each in (d, -d))
         return d if front >= back else -d
 
     def theta(self, w: FloatArray, d: FloatArray) -> FloatArray:
-        """Parameters (6,) of the motion (w, d)."""
+        """Return the kernel's parameters (6,) for the motion (w, d)."""
         return self.kernel.theta(w, d)
 
     def motion(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """``(w, d)`` of the parameters."""
+        """Return ``(w, d)`` for the kernel's parameters."""
         return self.kernel.motion(theta)
 
     def motion_jacobian(self, theta: FloatArray) -> FloatArray:
-        """Derivative (6, 6) of (w, d) by the parameters."""
+        """Return the derivative (6, 6) of (w, d) by the kernel's parameters."""
         return self.kernel.motion_jacobian(theta)
 
 
 def inverse_definite(H: FloatArray) -> FloatArray | None:
-    """Inverse of a positive definite matrix whose unknowns have different units; None if it is not definite."""
+    """Invert a positive definite matrix whose unknowns have different units; None if it is not definite."""
     scale = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     if not values[0] > 1e-12 * values[-1]:
@@ -274,16 +278,17 @@ def pack(
     *,
     motion_parameters: Mapping[str, Any] | None = None,
 ) -> Packed:
-    """Measurements of a problem.
+    """Convert matches to the arrays of the compiled residuals.
 
     Args:
-        motion_model: by name; the residuals are those of this model's kernel.
-        use_tracks: without it, tracks count as independent left and right pairs.
-        motion_parameters: the model's own.
+        motion_model: name of the motion model whose kernel gives the residuals.
+        use_tracks: if False, tracks count as independent left and right pairs.
+        motion_parameters: the model's own parameters.
 
     Raises:
-        RsbenchError: no such model, or it has no kernel.
-        ValueError: tracks of a rig that is not described by its middle, or a match at which a camera shows no ray.
+        RsbenchError: the model does not exist or has no kernel.
+        ValueError: there are tracks but the rig's origin is not the middle of the baseline, or a match lies at a
+            pixel for which the lens has no ray.
     """
     kernel = load_kernel(motion_model, motion_parameters)
     tracks = correspondences.tracks if use_tracks else correspondences.tracks[:0]
@@ -314,12 +319,12 @@ def pack(
 
 
 def _rectified(rig: StereoRig, shutter: RollingShutter) -> bool:
-    """Whether a left-right match is one row of both images, read at one time."""
+    """Return whether the two ends of a left-right match lie on the same row and are read at the same time."""
     return rig.rectified and shutter.rows_together
 
 
 def pack_pairs(matches: FloatArray, side: Side, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
-    """(n, 7) or (n, 17) for ``kernels.pair_terms`` from matches (n, 4) of one camera."""
+    """Convert matches (n, 4) of one camera to the pairs (n, 7) or (n, 17) of ``residuals.pair_terms``."""
     camera, ends = rig.eye(side), (matches[:, :2], matches[:, 2:])
     out = np.zeros((len(matches), 7 if _rectified(rig, shutter) else 17))
     out[:, :2], out[:, 2:4] = (camera.unproject(end)[:, :2] for end in ends)
@@ -333,7 +338,7 @@ def pack_pairs(matches: FloatArray, side: Side, rig: StereoRig, shutter: Rolling
 
 
 def _pack_timed_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
-    """(n, 4, 9) for ``residuals.timed_track_terms`` from tracks (n, 8)."""
+    """Convert tracks (n, 8) to the tracks (n, 4, 9) of ``residuals.timed_track_terms``."""
     out = np.zeros((len(tracks), 4, 9))
     for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
         end, eye = tracks[:, 2 * k : 2 * k + 2], rig.eye(side)
@@ -351,7 +356,7 @@ def _check_rays(rays: FloatArray, rig: StereoRig) -> None:
 
 
 def _pack_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) -> FloatArray:
-    """(n, 8) for ``residuals.track_terms`` from tracks (n, 8) of a rig whose rows are read together."""
+    """Convert tracks (n, 8) of a rig whose rows are read together to those (n, 8) of ``residuals.track_terms``."""
     camera = rig.camera
     middle = 0.5 * (tracks[:, [0, 1, 4, 5]] + tracks[:, [2, 3, 6, 7]])
     out = np.zeros((len(tracks), 8))
@@ -365,18 +370,18 @@ def _pack_tracks(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter) ->
 
 
 class Each(NamedTuple):
-    """The pairs and then the tracks of a problem, n in all, at one motion."""
+    """Errors and derivatives of each measurement at one motion: pairs, then tracks, n in all."""
 
     squares: FloatArray
     """(n,) squared whitened errors, px^2."""
     gradients: FloatArray
-    """(n, 6) of half the square."""
+    """(n, 6) gradients of half the squares."""
     hessians: FloatArray
-    """(n, 6, 6) of Gauss and Newton."""
+    """(n, 6, 6) Gauss-Newton Hessians of half the squares."""
 
 
 def each_term(packed: Packed, theta: FloatArray) -> Each:
-    """The terms of ``Packed.normal_equations``; the squares of tracks include their row checks."""
+    """Return the individual terms of ``Packed.normal_equations``; squares of tracks include their row checks."""
     pairs, count = len(packed.pairs), len(packed.pairs) + len(packed.tracks)
     squares, g, H = np.zeros(count), np.zeros((count, 6)), np.zeros((count, 6, 6))
     first, last, camera = slice(pairs), slice(pairs, None), (packed.focal, packed.h)
@@ -422,17 +427,17 @@ def _each_track(
 
 
 _FEWEST = 30
-"""Least number of measurements, five for each parameter: fewer do not determine their distribution."""
+"""Smallest number of measurements, five per parameter: fewer do not determine the distribution of the errors."""
 _TAILS = (3.0, 5.0, 10.0, 30.0)
-"""Degrees of freedom to choose from: SIFT under photon noise has about 3; 30 is practically normal."""
+"""Candidates for nu: SIFT features under photon noise have about 3; 30 is practically a normal distribution."""
 _REACH = 10.0
-"""Errors, in scales, beyond which a match is wrong: its weight would be below 0.04."""
+"""Error, in scales, beyond which a match is an outlier: its weight would be below 0.04."""
 _FIRST_NU, _MIXTURE_STEPS, _MOST_RIGHT = 3.0, 4, 0.999
-"""Initial degrees of freedom; rounds of the mixture's EM; largest share of right matches within the ten scales."""
+"""Initial nu, number of EM iterations for the mixture, and largest share of inliers within the ten scales."""
 _SHIFT_STEP_PX = 1e-3
 """Step of numerical derivatives by the pixels of measurements, px."""
 _EXACT_PX = 1e-7
-"""Noise below which matches are exact."""
+"""Noise below which matches count as exact."""
 _SAFE_LEVERAGE, _TIMES_THE_MEAN = 0.2, 3.0
 _LEVERAGE_STEPS = 4
 _SCALE_STEPS, _SCALE_FLAT = 50, 1e-4
@@ -441,60 +446,61 @@ _LEAST_SLOPE = 0.1
 _LEAST_SCALE_PX = 1e-9
 TRACK_FREEDOM, _PAIR_FREEDOM, _PARAMETERS = 5, 1, 6
 _PARTS, _PART_TRACKS = 6, 10
-"""Most groups of rows whose motions are compared, and fewest tracks in each."""
+"""Largest number of groups of rows whose motions are compared, and smallest number of tracks in each."""
 _SHARED, _CHANCE, _PER_EXCESS = 1.5, 1e-3, 2.0
-"""Dispersion due to correlated errors of neighbours, level at which rows contradict a motion model, and weight of
-their excess scatter, chosen on draws like those of the track points-2 (seeds 4000 to 4239)."""
+"""Dispersion that correlated errors of neighbours cause, significance level at which rows contradict a motion
+model, and weight of their excess scatter; chosen on draws like those of the track points-2 (seeds 4000 to
+4239)."""
 
 
 class Rows(NamedTuple):
-    """The test whether one motion fits all groups of rows, see ``HeavyTailed.by_rows``."""
+    """Result of testing whether one motion fits all groups of rows, see ``HeavyTailed.by_rows``."""
 
     square: float
     """Chi-squared statistic."""
     freedom: int
 
     def dispersion(self, shared: float) -> float:
-        """Factor, at least 1, on a covariance that has a factor ``shared`` for correlated errors of neighbours.
+        """Return a factor, at least 1, for a covariance already multiplied by ``shared`` for common errors.
 
-        Scatter due to errors common to a group of rows counts once. Where the camera leaves the motion model, the
-        excess counts ``_PER_EXCESS`` times: the estimate has the information of all groups, but the error of one.
+        Scatter due to errors common to a group of rows counts once. If the camera departs from the motion model,
+        the excess counts ``_PER_EXCESS`` times: the estimate has the information of all groups, but the error of
+        one.
         """
         scatter = self.square / self.freedom
         return max(1.0, scatter, 1.0 + _PER_EXCESS * (scatter / shared - 1.0))
 
     @property
     def contradict(self) -> bool:
-        """Whether no motion of the model fits all rows, even with correlated errors of neighbours."""
+        """Whether no motion of the model fits all rows, even if errors of neighbours are correlated."""
         return self.square > _SHARED * float(scipy.special.chdtri(self.freedom, _CHANCE))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeavyTailed(Packed):
-    """Measurements of one problem, as ``Packed``, with the distribution of their errors."""
+    """Measurements of one problem, like ``Packed``, with heavy-tailed errors of known distribution."""
 
     nu: float
     scale: float
     """s, px."""
     trust: FloatArray
-    """(n + m,) weights of the pairs and of the tracks, at most 1: those of Mallows times the probability to be
-    right."""
+    """(n + m,) factors on the weights of pairs and tracks, at most 1: Mallows weight times inlier probability."""
     doubt: FloatArray | None = None
-    """(n + m,) probability that each is wrong; None: 0."""
+    """(n + m,) probability that each measurement is an outlier; None means 0."""
 
     def weights(self, squares: FloatArray) -> FloatArray:
-        """(n + m,) of the measurements in a step that minimises their squared errors."""
+        """Return the weights (n + m,) of the squared errors in iteratively reweighted least squares."""
         return self.trust * (self.nu + self.freedom) / (self.nu + squares / self.scale**2)
 
     def slopes(self, squares: FloatArray) -> FloatArray:
-        """(n + m,) derivative of weight times residual, on average over the directions of the p residuals."""
+        """Return derivatives (n + m,) of weight times residual, averaged over directions of the residuals."""
         bend = 2.0 * squares / self.freedom / (self.nu * self.scale**2 + squares)
         return self.weights(squares) * (1.0 - bend)
 
     def normal_equations(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Negative logarithm of the likelihood times s^2, px^2, its gradient (6,) and its Hessian (6, 6).
+        """Return the negative log-likelihood times s^2, px^2, its gradient (6,) and its Hessian (6, 6).
 
-        Measurements so far off that their part of the Hessian is negative count there by a tenth of their weight.
+        Each measurement counts in the Hessian by at least a tenth of its weight; far outliers would be negative.
         """
         each = each_term(self, theta)
         costs = 0.5 * self.trust * (self.nu + self.freedom) * np.log1p(each.squares / (self.nu * self.scale**2))
@@ -504,21 +510,21 @@ class HeavyTailed(Packed):
         return self.scale**2 * float(np.sum(costs)), gradient, self.definite(theta, H)
 
     def pair_costs(self, theta: FloatArray) -> FloatArray:
-        """Twice what each of the pairs (n,) adds to the cost, px^2."""
+        """Return twice the contribution of each pair (n,) to the cost, px^2."""
         squares = self.pair_residuals(theta) ** 2
         trust = self.trust[: len(squares)] * (self.nu + _PAIR_FREEDOM)
         return trust * self.scale**2 * np.log1p(squares / (self.nu * self.scale**2))
 
     def noise_variance(self, cost: float) -> float:
-        """Variance of a coordinate, px^2, without tails: two thirds of the errors are below its root."""
+        """Return the variance of a coordinate, px^2, disregarding tails: 68 % of the errors are below its root."""
         return (self.scale * float(scipy.special.stdtrit(self.nu, _ONE_SIGMA))) ** 2
 
     def stated(self, theta: FloatArray, cost: float = 0.0, H: FloatArray | None = None) -> Stated | None:
-        """The covariance for any distribution of the errors, with its ingredients; None if there is none.
+        """Return the covariance, which is valid for any distribution of the errors; None if it is undefined.
 
         See ``core.uncertainty``. The Hessian of the mixture is that of the t distribution minus the information
-        that is lost because the right measurements are unknown (T. Louis, J. Royal Statistical Society B 1982). A
-        track is one measurement: errors that its keypoints share are counted together.
+        that is lost because the inliers are not known for certain (T. Louis, J. Royal Statistical Society B 1982).
+        A track is one measurement: correlated errors of its keypoints are counted together.
         """
         each, variance = each_term(self, theta), self.scale**2
         weights = self.weights(each.squares)
@@ -535,11 +541,11 @@ class HeavyTailed(Packed):
         return self._stated(theta, each, weights, inverse, variance * information, self.noise_variance(0.0))
 
     def by_rows(self, theta: FloatArray) -> Rows | None:
-        """Test whether the residuals of a motion model depend on the readout time of the rows; None: few tracks.
+        """Test whether the residuals of a motion model depend on the rows' readout time; None below 30 tracks.
 
         If the model is right, the step to the best motion of each group of rows, squared and normalised by its
-        information, is chi-squared with six degrees of freedom, for all groups but one (score test, C. Rao, Proc.
-        Cambridge Philosophical Society 1948).
+        information, is chi-squared distributed; all groups but one have six degrees of freedom each (score test,
+        C. Rao, Proc. Cambridge Philosophical Society 1948).
         """
         times = self.tracks[:, 0, 2] if self.tracks.ndim == 3 else self.tracks[:, 6]
         if len(times) < _FEWEST:
@@ -558,10 +564,10 @@ class HeavyTailed(Packed):
 
 
 def heavy_tailed(packed: Packed, theta: FloatArray, scale: float) -> HeavyTailed | None:
-    """The distribution of the errors at a motion near the right one; None for fewer than 30 measurements.
+    """Estimate the distribution of the errors at a motion near the true one; None below 30 measurements.
 
     Args:
-        scale: px, of the first guess: measurements beyond 10 of them are wrong.
+        scale: first guess of the scale s, px; measurements with errors beyond 10 scales are outliers.
     """
     each = each_term(packed, theta)
     freedom = packed.freedom
@@ -583,10 +589,10 @@ def heavy_tailed(packed: Packed, theta: FloatArray, scale: float) -> HeavyTailed
 
 
 def _probability_right(q: FloatArray, p: FloatArray, nu: float, scale: float, share: float) -> FloatArray:
-    """Probability (n,) that measurements within the ten scales are right, if there is a share of wrong ones.
+    """Return the probability (n,) that each measurement within the ten scales is an inlier.
 
     Args:
-        share: of right ones among them.
+        share: proportion of inliers among them.
     """
     gammaln = scipy.special.gammaln
     inside = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * (nu + p) * np.log1p(q / (nu * scale**2))
@@ -603,14 +609,14 @@ def t_distribution(
     least: float = _LEAST_SCALE_PX,
     count: FloatArray | None = None,
 ) -> tuple[float, float]:
-    """nu and s that maximise the likelihood.
+    """Return nu (one of ``_TAILS``) and s that maximise the likelihood.
 
     Args:
         squares: (n,) squared errors of measurements, px^2, of p (n,) residuals each.
-        scale: a first guess of s, px.
-        freedom: residuals less the degrees of freedom that the fit has taken.
-        least: of s.
-        count: (n,) how much each measurement counts; None: 1.
+        scale: first guess of s, px.
+        freedom: number of residuals minus the number of fitted parameters.
+        least: lower bound of s, px.
+        count: (n,) weight of each measurement in the likelihood; None means 1.
     """
     count = np.ones(len(p)) if count is None else count
     found = [(nu, _scale(squares, p, nu, scale, freedom, least, count)) for nu in _TAILS]
@@ -620,10 +626,10 @@ def t_distribution(
 def _scale(
     squares: FloatArray, p: FloatArray, nu: float, scale: float, freedom: float, least: float, count: FloatArray
 ) -> float:
-    """Scale of the largest likelihood.
+    """Return the scale of maximum likelihood for a given nu.
 
-    By the parameter-expanded EM algorithm, in half the steps of the plain one: the mean that weights have in the
-    end is known, and a step divides by the one they have (C. Liu, D. Rubin, Y. Wu, Biometrika 1998).
+    The parameter-expanded EM algorithm needs half the steps of plain EM: the mean of the weights at convergence is
+    known, so each step divides by their present mean instead (C. Liu, D. Rubin, Y. Wu, Biometrika 1998).
     """
     mean = float(np.sum(count)) + (float(count @ p) - freedom) / nu
     for _ in range(_SCALE_STEPS):
@@ -636,14 +642,17 @@ def _scale(
 
 
 def _likelihood(squares: FloatArray, p: FloatArray, nu: float, scale: float, count: FloatArray) -> float:
-    """Logarithm, without terms that are the same for all nu and scales."""
+    """Return the log-likelihood, without terms that are the same for all nu and scales."""
     gammaln = scipy.special.gammaln
     norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * scale**2)
     return float(count @ (norm - 0.5 * (nu + p) * np.log1p(squares / (nu * scale**2))))
 
 
 def _leverages(packed: Packed, theta: FloatArray, each: Each, weights: FloatArray) -> FloatArray:
-    """(n,) traces of H^-1 H_i: each one's share of the sum H of the H_i; in sum 6, or 5 of one camera."""
+    """Return each measurement's leverage (n,), the trace of H^-1 H_i with H the sum of the weighted Hessians H_i.
+
+    The leverages sum to 6, or to 5 for one camera; they are 0 if H is singular.
+    """
     inverse = inverse_definite(packed.definite(theta, np.tensordot(weights, each.hessians, 1)))
     if inverse is None:
         return np.zeros(len(weights))
@@ -651,7 +660,7 @@ def _leverages(packed: Packed, theta: FloatArray, each: Each, weights: FloatArra
 
 
 def _bounded(packed: Packed, theta: FloatArray, each: Each, weights: FloatArray) -> FloatArray:
-    """Factors (n,) up to 1 that bring every leverage to 0.2, or to three times the mean where data are few."""
+    """Return factors (n,), at most 1, that reduce leverages to 0.2, or to three times the mean if that is more."""
     bound = min(max(_SAFE_LEVERAGE, _TIMES_THE_MEAN * _PARAMETERS / max(len(weights), 1)), 0.9)
     factors = np.ones(len(weights))
     for _ in range(_LEVERAGE_STEPS):
@@ -659,23 +668,23 @@ def _bounded(packed: Packed, theta: FloatArray, each: Each, weights: FloatArray)
         high = share > bound
         if not np.any(high):
             break
-        # One measurement against all others: its odds are in proportion to its weight.
+        # With all other weights fixed, share / (1 - share) is proportional to the measurement's weight.
         factors[high] *= bound / (1.0 - bound) * (1.0 - share[high]) / share[high]
     return factors
 
 
 _TRIPLE_DAMPING = 1e-4
 _APART, _LEAST_DURATION = 0.05, 0.05
-"""Frame periods between the two ends of a stereo pair from which on they are apart; and that an end takes to the
-next frame, at least, but for wrong ones."""
+"""Frame periods between the two ends of a stereo pair above which ``Packed.apart`` is set, and shortest plausible
+time from an end to the same end in the next frame (only wrong matches have less)."""
 
 
 def solve_triples(packed: Packed, samples: NDArray[np.int64], iterations: int = 4) -> FloatArray:
-    """Parameters (b, 6) of samples (b, k) of k >= 3 tracks; NaN where the step is not determined.
+    """Return motion parameters (b, 6) for samples (b, k) of k >= 3 tracks; NaN if a step is undetermined.
 
-    Damped Gauss-Newton from no motion at all, whose first step is the linear stereo pose-from-points solution;
-    where the ends of stereo pairs are ``apart``, from the solution of those ``at_once``.
-    A step that does not lower the cost is not taken and the damping grows.
+    Damped Gauss-Newton starts at zero motion, so that its first step is the linear stereo pose-from-points
+    solution; if ``packed.apart``, it starts at the solution for the tracks of ``at_once``. A step that raises the
+    cost is rejected and the damping grows.
     """
     out = np.zeros((len(samples), 6))
     for each in (packed.at_once(), packed) if packed.apart else (packed,):
@@ -722,14 +731,15 @@ def _descend(
                 damping *= 0.1
             else:
                 damping *= 10.0
-        # Copying by elements, and swapping above: the error of a copy between slices takes a second to compile.
+        # Elements are copied one by one, and arrays swapped above: the shape check of a slice copy takes a second
+        # to compile.
         for k in range(6):
             out[s, k] = theta[k]
 
 
 @compiled
 def _sum(values: FloatArray) -> float:
-    """As ``values.sum()``. Here and above, code that Numba has of arrays would load ``scipy.linalg`` and more."""
+    """Return ``values.sum()``; Numba's array functions, here and above, would load ``scipy.linalg``."""
     total = 0.0
     for k in range(len(values)):
         total += values[k]

@@ -1,5 +1,4 @@
-"""LO-RANSAC that knows no geometry: uniform minimal samples, MSAC score, local optimisation, exact stopping
-rule.
+"""LO-RANSAC for any kind of model: uniform minimal samples, MSAC score, local optimisation, exact stopping rule.
 
 M. Fischler, R. Bolles, CACM 1981; P. Torr, A. Zisserman, MLESAC, CVIU 2000 (MSAC); O. Chum, J. Matas, J.
 Kittler, Locally Optimized RANSAC, DAGM 2003.
@@ -22,55 +21,55 @@ Model = TypeVar("Model")
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 _BATCH = 10
-"""Samples drawn at a time: a compiled solver does a batch for little more than one."""
+"""Number of samples drawn at a time; for a compiled solver, a batch takes little longer than one sample."""
 _MOST_STEPS = 10**9
 
 
 class Estimator(Protocol[Model]):
-    """A model to estimate. Data are indices 0 ... sum(num_data) - 1, in groups that are sampled separately."""
+    """Interface to a model. Data have indices 0 ... sum(num_data) - 1, in groups that are sampled separately."""
 
     @property
     def num_data(self) -> tuple[int, ...]:
-        """Data per group; a plain problem has one group."""
+        """Number of data in each group; a simple problem has one group."""
 
     @property
     def sample_size(self) -> tuple[int, ...]:
-        """Data that a minimal sample takes from each group; 0 where a group is only scored."""
+        """Number of data of each group in a minimal sample; 0 if a group is only used for scoring."""
 
     def generate(self, samples: IntArray) -> Iterable[list[Model]]:
-        """Models of each minimal sample (b, sum(sample_size)) of indices; none where a sample gives none."""
+        """Yield a list of models, possibly empty, for each minimal sample of indices (b, sum(sample_size))."""
 
     def residuals(self, model: Model) -> FloatArray:
-        """Errors of all data, (sum(num_data),), in the unit of the threshold; infinite where there is none."""
+        """Return errors of all data, (sum(num_data),), in the unit of the threshold; infinite if undefined."""
 
     def refine(self, model: Model, inliers: BoolArray) -> Model | None:
-        """A better model from all inliers, or None."""
+        """Refine a model with all its inliers; None if that fails."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions:
-    """How long to search."""
+    """Options for the length of the search."""
 
     confidence: float = 0.999
     """Probability, 0 to 1, of having drawn a sample without outliers when RANSAC stops."""
     min_iterations: int = 10
-    """Samples that RANSAC draws, at least."""
+    """Smallest number of samples that RANSAC draws."""
     max_iterations: int = 1000
-    """Samples that RANSAC draws, at most."""
+    """Largest number of samples that RANSAC draws."""
     lo_steps: int = 3
     """Refinements of each new best model, at thresholds that shrink from twice the threshold to it."""
     final_steps: int = 3
-    """Refinements at the end, until the inliers stay the same."""
+    """Largest number of refinements at the end, which stop when the score no longer improves."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RansacOptions(SearchOptions):
-    """How long to search and what counts as an inlier."""
+    """Options for the length of the search and for inliers."""
 
     threshold: float
     """Largest absolute residual of an inlier."""
     chance: float = 0.02
-    """Probability that a wrong datum is an inlier of a given model: a consensus must be beyond chance."""
+    """Probability that an outlier fits a given model by chance, used to reject a consensus of outliers."""
 
     def __post_init__(self) -> None:
         arguments.check_positive("threshold", self.threshold, arguments.LARGEST_PX, "pixels")
@@ -92,7 +91,7 @@ class RansacOptions(SearchOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RansacReport(Generic[Model]):
-    """The outcome; every field speaks about the final model."""
+    """Result of a search; inliers and score are those of the final model."""
 
     success: bool
     reason: str
@@ -101,18 +100,18 @@ class RansacReport(Generic[Model]):
     """(sum(num_data),); all False after a failure."""
     iterations: int
     score: float
-    """MSAC cost in units of the squared threshold: at most one per datum."""
+    """MSAC cost in units of the squared threshold, at most 1 per datum; infinite after a failure."""
 
 
 def msac_score(residuals: FloatArray, threshold: float) -> float:
-    """Sum of squared residuals over the squared threshold, each at most 1."""
+    """Return the sum over all data of the squared residual divided by the squared threshold, at most 1 each."""
     return float(np.sum(np.minimum((residuals / threshold) ** 2, 1.0)))
 
 
 def all_inlier_probability(
     inliers: tuple[int, ...], num_data: tuple[int, ...], sample_size: tuple[int, ...]
 ) -> float:
-    """Probability that a sample drawn without replacement holds inliers only (hypergeometric)."""
+    """Return the probability that a sample drawn without replacement has inliers only (hypergeometric)."""
     probability = 1.0
     for good, total, size in zip(inliers, num_data, sample_size, strict=True):
         if good < size:
@@ -122,7 +121,10 @@ def all_inlier_probability(
 
 
 def required_iterations(probability: float, confidence: float) -> float:
-    """Independent samples after which one was all inliers with the given confidence; infinite when none can be."""
+    """Return the number of samples after which, with the given confidence, one had inliers only.
+
+    ``probability`` is that of a single sample; if it is 0, the result is infinite.
+    """
     if probability <= 0.0:
         return math.inf
     if probability >= 1.0:
@@ -131,17 +133,17 @@ def required_iterations(probability: float, confidence: float) -> float:
 
 
 def log10_false_alarms(inliers: int, num_data: int, sample_size: int, samples: int, chance: float) -> float:
-    """log10 of how many models with as many inliers ``samples`` samples of wrong data alone would give.
+    """Return log10 of the expected number of models with as many inliers if all data were outliers.
 
-    L. Moisan, B. Stival, A probabilistic criterion to detect rigid point matches, IJCV 2004: above 0 the
-    consensus proves nothing.
+    ``samples`` is the number of samples drawn. If the result is 0 or more, the consensus may be due to chance
+    (L. Moisan, B. Stival, A probabilistic criterion to detect rigid point matches, IJCV 2004).
     """
     choices = math.lgamma(num_data + 1) - math.lgamma(inliers + 1) - math.lgamma(num_data - inliers + 1)
     return math.log10(max(samples, 1)) + choices / math.log(10.0) + (inliers - sample_size) * math.log10(chance)
 
 
 class _Best(Generic[Model]):
-    """The best model so far, with what follows from it."""
+    """The best model so far, with its residuals and score."""
 
     def __init__(self, estimator: Estimator[Model], options: RansacOptions) -> None:
         self.estimator, self.threshold, self.chance = estimator, options.threshold, options.chance
@@ -150,7 +152,7 @@ class _Best(Generic[Model]):
         self.score = math.inf
 
     def offer(self, model: Model | None) -> bool:
-        """Take the model if it scores better."""
+        """Replace the best model if the given one has a lower cost; return whether it was replaced."""
         if model is None:
             return False
         residuals = np.abs(self.estimator.residuals(model))
@@ -187,7 +189,7 @@ def ransac(estimator: Estimator[Model], options: RansacOptions, rng: np.random.G
 
 
 def _proposals(estimator: Estimator[Model], rng: np.random.Generator) -> Iterator[list[Model]]:
-    """Models of one random minimal sample after the other, without end."""
+    """Yield the models of random minimal samples, without end."""
     counts, sizes = estimator.num_data, estimator.sample_size
     groups = list(zip(_starts(counts), counts, sizes, strict=True))
     while True:
@@ -199,7 +201,7 @@ def _proposals(estimator: Estimator[Model], rng: np.random.Generator) -> Iterato
 
 
 def _starts(counts: tuple[int, ...]) -> IntArray:
-    """Index of the first datum of each group."""
+    """Return the index of the first datum of each group."""
     return np.cumsum([0, *counts[:-1]], dtype=np.int64)
 
 
@@ -211,7 +213,7 @@ def _sample_probability(best: _Best[Model]) -> float:
 
 
 def _optimise(best: _Best[Model], steps: int) -> None:
-    """Refine on inliers of a threshold that shrinks from twice the final one."""
+    """Refine with inliers of a threshold that shrinks from twice the final threshold to the final one."""
     for k in range(steps):
         factor = 2.0 - k / max(steps - 1, 1)
         if not _step(best, factor) and factor <= 1.0:

@@ -3,33 +3,33 @@
 Parameters are ``theta = (w, v)``; the motion model is a ``MotionKernel``. The readable NumPy forms are in
 ``rsbench.core.epipolar``, named in each function; the tests compare both.
 
-Pairs have a Sampson error. Its cost needs the derivative of its own weights, or it shrinks v towards the zero
-where every constraint vanishes. Taking the constraint's derivative at the corrected measurement gives just that
-gradient.
+The error of a pair is its Sampson error. The gradient of its square must include the derivative of the weights,
+or a descent shrinks v towards zero, where every constraint vanishes. Evaluating the constraint's derivative by the
+motion at the corrected measurement gives exactly this gradient.
 
-Tracks whose rows both cameras read at the same time have the first-order form of a rolling-shutter bundle
-adjustment: a stereo pair is then an ordinary rectified pair. In the camera halfway between both, ``m = (x, y,
-disparity)`` with x = (xl + xr)/2, y = (yl + yr)/2 holds all that the pair measures of the point; its three
-parts have independent noise of variance (1/2, 1/2, 2). What is left, yl - yr, is independent of m and of the
-motion. The body's motion then predicts m of frame 1 from m of frame 0:
+For tracks whose rows both cameras read at the same time, the error is a first-order form of rolling-shutter bundle
+adjustment, since each stereo pair is then an ordinary rectified pair. In a camera halfway between both, ``m = (x,
+y, disparity)`` with x = (xl + xr)/2, y = (yl + yr)/2 contains all information of the pair on the point; its three
+components have independent noise of variance (1/2, 1/2, 2). The remaining measurement, yl - yr, is independent of
+m and of the motion. The body's motion then predicts m of frame 1 from m of frame 0:
 
     p = R ray(x0, y0) + rho0 T,   rho0 = disparity0 / (fx baseline) = 1 / z0
     x1 = fx p_x / p_z + cx,  y1 = fy p_y / p_z + cy,  disparity1 = disparity0 / p_z
 
-Whitened with the noise of both frames (multi-constraint Sampson error), these three equations are the
-reprojection error of the best point, to first order. They stay regular without motion and for points at
-infinity.
+Whitened with the noise of both frames (multi-constraint Sampson error), the residuals of these three equations
+are, to first order, the reprojection error of the best 3D point. They stay regular at zero motion and for points
+at infinity.
 
-Timed tracks have four ends with times of their own: a lens bends rows, so that both cameras read a point at
-different times; so do other scans and a late right camera. Their error is the reprojection error of the best
-point: each track has a point of its own, (x, y, 1) / rho in the left camera at the time of its first end, which
-few Gauss-Newton steps find and the normal equations leave out (Schur complement; Triggs et al., Bundle
-Adjustment, 2000). A pixel that is shifted is also read at another time, which counts in the noise of an end.
+In timed tracks, each of the four ends has its own time. Both cameras read a point at different times if a lens
+bends the rows, if they scan differently or if the right camera is delayed. The error is the reprojection error of
+the best 3D point: each track has a point (x, y, 1) / rho in the left camera at the time of its first end, which is
+found by a few Gauss-Newton steps and eliminated from the normal equations (Schur complement; Triggs et al., Bundle
+Adjustment, 2000). The noise of an end includes that a shifted pixel is also read at another time.
 
-``add_pairs`` and ``add_tracks`` are the equations by the motion and by unknowns of the capture too: readout
-ratio, delay, lens and the like. Such an unknown changes where and when the ends of a match are, so ray and time
-of each end have a derivative by it, and one pass over the measurements gives the equations of all unknowns.
-Their errors have heavy tails (``packed.HeavyTailed``).
+``add_pairs`` and ``add_tracks`` give the normal equations by the motion and by further unknowns of the capture,
+such as readout ratio, delay and lens. Such an unknown changes the position and the time of the ends of a match.
+Given the derivatives of each end's ray and time, one pass over the measurements gives the equations of all
+unknowns. Here the errors are heavy-tailed (``packed.HeavyTailed``).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from rsbench.core.so3 import FloatArray
 
 Matrix = tuple[float, float, float, float]
 BEHIND = 1e12
-"""Squared error, px^2, of a track that the motion puts behind the camera; no descent step ever accepts it."""
+"""Squared error, px^2, of a track whose point the motion puts behind the camera; descents reject such steps."""
 NEAREST = 1e-6
 """Least ratio of a track's depths in frame 1 and frame 0."""
 
@@ -71,13 +71,14 @@ def pair_terms(
     gradient: FloatArray,
     want: bool,
 ) -> None:
-    """Sampson residuals of left or right pairs, and the normal equations of half their sum of squares.
+    """Compute Sampson residuals of left or right pairs, and the normal equations of half their sum of squares.
 
     Args:
         theta: (6,) w and v.
         pairs: (n, 7) ray 0 (x, y), ray 1 (x, y), tau0, tau1, x of the camera's offset from the body in metres; or
-            (n, 17) with what ``at_pixels`` names, where the lens or the scan make it differ.
-        focal: (2,) fx, fy in pixels; h: frame periods per row, of pairs (n, 7).
+            (n, 17) with the derivatives of ``at_pixels`` too, if the rig is not rectified or rows have other
+            times.
+        focal: (2,) fx, fy in pixels; h: frame periods per row, used for pairs (n, 7) only.
         residuals: (n,) filled, in pixels.
         H, gradient: (6, 6), (6,), added to when ``want``.
     """
@@ -105,7 +106,7 @@ def pair_terms(
 
 @compiled
 def at_pixels(pairs: FloatArray, m: int, h: float) -> tuple[Matrix, Matrix, tuple[float, float]]:
-    """Derivatives of both ideal pixels by the pixels (2 x 2, rows first), and of tau by the pixel."""
+    """Return the derivatives of both ideal pixels by the pixels (2 x 2, row by row), and of tau by the pixel."""
     if pairs.shape[1] == 7:
         return (1.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0), (0.0, h)
     return (
@@ -117,13 +118,16 @@ def at_pixels(pairs: FloatArray, m: int, h: float) -> tuple[Matrix, Matrix, tupl
 
 @compiled
 def shifted(ray: Vector, L: Matrix, dx: float, dy: float, focal: FloatArray) -> Vector:
-    """The ray of a pixel that is (dx, dy) less."""
+    """Return the ray of the pixel shifted by (-dx, -dy)."""
     return (ray[0] - (L[0] * dx + L[1] * dy) / focal[0], ray[1] - (L[2] * dx + L[3] * dy) / focal[1], 1.0)
 
 
 @compiled
 def displacement(p: Vector, y: Vector, focal: FloatArray) -> float:
-    """Error (px) of a pair where the camera only turns: its constraint vanishes, and would let anything pass."""
+    """Return the error (px) of a pair without translation, for which the constraint always vanishes.
+
+    It is the distance of the match from the rotated point, divided by sqrt(2).
+    """
     if p[2] <= 0.0:
         return math.sqrt(BEHIND)
     return math.hypot(focal[0] * (y[0] - p[0] / p[2]), focal[1] * (y[1] - p[1] / p[2])) / math.sqrt(2.0)
@@ -133,7 +137,7 @@ def displacement(p: Vector, y: Vector, focal: FloatArray) -> float:
 def _camera_move(
     theta: FloatArray, kernel: MotionKernel, tau0: float, tau1: float, offset: float, R: FloatArray, A: FloatArray
 ) -> Moved:
-    """``kernel.move`` of a camera whose x is larger than the body's by ``offset``."""
+    """Return ``kernel.move`` for a camera in which x is larger than in the body by ``offset``."""
     T, rate0, rate1, spin0, spin1 = kernel.move(theta, tau0, tau1, R, A)
     Ro = times(offset, _of(R, 0))
     T = plus((T[0] + offset, T[1], T[2]), -1.0, Ro)
@@ -151,9 +155,10 @@ def pair_gradient(
     L1: Matrix,
     slope: tuple[float, float],
 ) -> tuple[float, Matrix]:
-    """Value of y^T [T]x R x, and its derivative by the four pixel coordinates; NumPy: ``epipolar.rs_constraint``.
+    """Return y^T [T]x R x and its derivative by the four pixel coordinates; NumPy: ``epipolar.rs_constraint``.
 
-    The paper's (7) before its linearisation: E = [T]x R of (6). The rates are T's by the two times, the spins R's.
+    This is the paper's (7) before linearisation, with E = [T]x R from (6). In ``moved``, the rates are the
+    derivatives of T by the two times, the spins those of R.
     """
     T, rate0, rate1, spin0, spin1 = moved
     p = apply(R, x)
@@ -183,7 +188,7 @@ def pair_jacobian(
     T_v: FloatArray,
     J: FloatArray,
 ) -> None:
-    """Derivative (6,) of y^T [T]x R x by theta; R, A, T_w, T_v are work space."""
+    """Fill J (6,) with the derivative of y^T [T]x R x by theta; R, A, T_w, T_v are work space."""
     T, _, _, _, _ = kernel.move(theta, tau0, tau1, R, A)
     kernel.translation_jacobian(theta, tau0, tau1, R, A, T_w, T_v)
     Ro = times(offset, _of(R, 0))
@@ -199,7 +204,7 @@ def pair_jacobian(
 
 @compiled
 def count_in_front(theta: FloatArray, kernel: MotionKernel, pairs: FloatArray) -> int:
-    """How many pairs (n, 7 or 17) have both closest points in front of their cameras; parallel rays do not."""
+    """Count pairs (n, 7 or 17) whose rays come closest in front of both cameras; parallel rays do not count."""
     R, A = np.zeros((3, 3)), np.zeros((3, 3))
     count = 0
     for m in range(len(pairs)):
@@ -214,7 +219,7 @@ def count_in_front(theta: FloatArray, kernel: MotionKernel, pairs: FloatArray) -
 
 
 _POINT_STEPS = 2
-"""Steps to the best point: an error of 1 px leaves 1e-3 px after one and 1e-9 after two."""
+"""Gauss-Newton steps to the best point: an error of 1 px becomes 1e-3 px after one step and 1e-9 after two."""
 
 
 @compiled
@@ -229,12 +234,13 @@ def timed_track_terms(
     gradient: FloatArray,
     want: bool,
 ) -> None:
-    """Squared reprojection errors of the best points of tracks, and the normal equations of half their sum.
+    """Compute tracks' squared reprojection errors at their best points, and the normal equations of half their
+    sum.
 
     Args:
         theta: (6,) w and v.
         tracks: (n, 4, 9) ends left 0, right 0, left 1, right 1: ray (x, y), tau, derivative of the ideal pixel by
-            the pixel (2 x 2, rows first), derivative of tau by the pixel (2).
+            the pixel (2 x 2, row by row), derivative of tau by the pixel (2).
         focal: (2,) fx, fy in pixels; baseline: metres.
         squares: (n,) filled, px^2: chi-squared with 5 degrees of freedom at a noise of 1 px.
         H, gradient: (6, 6), (6,), added to when ``want``.
@@ -265,10 +271,10 @@ def linearise_best(
     inverse: FloatArray,
     work: FloatArray,
 ) -> bool:
-    """Errors and derivatives of one track at its best point; False when the ends determine none before a camera.
+    """Fill errors and derivatives of one track at its best point; False if no point in front is determined.
 
     Args:
-        ends: (4, 9) of the track.
+        ends: (4, 9) ends of the track.
         e, D, W: see ``_linearise``; N, inverse: (3, 3) normal matrix of the point, and its inverse.
         work: (6, 3, 3); the last two hold the pixels' velocities, see ``_linearise``.
     """
@@ -277,7 +283,7 @@ def linearise_best(
         if step > 0:
             g = (_product(D[:, 0], e), _product(D[:, 1], e), _product(D[:, 2], e))
             point = plus(point, -1.0, apply(inverse, g))
-        # Weighed where it starts. A literal True would compile _linearise once more.
+        # The weights are those at the first point. A literal True would compile _linearise once more.
         seen = _linearise(theta, kernel, ends, focal, baseline, point, e, D, W, work, step == 0)
         if not seen:
             return False
@@ -293,7 +299,7 @@ def linearise_best(
 def _first_point(
     theta: FloatArray, kernel: MotionKernel, ends: FloatArray, baseline: float, work: FloatArray
 ) -> Vector:
-    """x, y and inverse depth of the point that the stereo pair of frame 0 shows; rho is NaN for none."""
+    """Triangulate the stereo pair of frame 0: return x, y and inverse depth rho, NaN if undetermined."""
     R, A = work[0], work[1]
     x, half = (ends[0, 0], ends[0, 1], 1.0), 0.5 * baseline
     T, _, _, _, _ = kernel.move(theta, ends[0, 2], ends[1, 2], R, A)
@@ -323,9 +329,10 @@ def _linearise(
 ) -> bool:
     """Fill whitened errors e (8,) and their derivative D (8, 9) by the point and theta; False behind a camera.
 
-    ``weigh`` fills W (4, 2, 2) too, which takes errors in ideal pixels to pixels of unit noise. ``work[4:]`` gets
-    the derivatives of the predicted pixels of the right camera's frame 0 and of frame 1 (columns) by the time of
-    the first end (4) and by their own (5): x and y in the first two rows. That of the first end does not move.
+    If ``weigh``, W (4, 2, 2) is filled too; it maps errors in ideal pixels to errors of unit noise. ``work[4]``
+    and ``work[5]`` get the derivatives of the predicted pixels (x and y in the first two rows; columns: right 0,
+    left 1, right 1) by the time of the first end and by their own time. The prediction of the first end does not
+    move.
     """
     R, A, T_w, T_v = work[0], work[1], work[2], work[3]
     half, rho = 0.5 * baseline, point[2]
@@ -365,7 +372,10 @@ def _linearise(
 def _fill_velocities(
     first: Vector, p: Vector, vx: float, vy: float, focal: FloatArray, work: FloatArray, column: int
 ) -> None:
-    """Fill a predicted pixel's velocities by its own time and by the first end's (which moves by ``first``)."""
+    """Fill a predicted pixel's derivatives by its own time, (vx, vy), and by the first end's time.
+
+    ``first`` is the derivative of the point p by the first end's time.
+    """
     work[4, 0, column] = focal[0] * (first[0] - p[0] / p[2] * first[2]) / p[2]
     work[4, 1, column] = focal[1] * (first[1] - p[1] / p[2] * first[2]) / p[2]
     work[5, 0, column], work[5, 1, column] = vx, vy
@@ -378,9 +388,10 @@ def _of(M: FloatArray, j: int) -> Vector:
 
 @compiled
 def _fill_weight(end: FloatArray, vx: float, vy: float, W: FloatArray) -> bool:
-    """W = (L - v s^T)^-1: the ideal pixel moves by L, the prediction by its velocity times the time's slope s.
+    """Fill W = (L - v s^T)^-1; False if the inverse does not exist.
 
-    False when there is none: the prediction moves with the line that is read.
+    A shift of the pixel moves the ideal pixel by L, and the prediction by its velocity v times the derivative s of
+    the readout time. The matrix is singular if the prediction moves with the line that is read.
     """
     a, b = end[3] - vx * end[7], end[4] - vx * end[8]
     c, d = end[5] - vy * end[7], end[6] - vy * end[8]
@@ -398,7 +409,7 @@ def whiten(W: FloatArray, x: float, y: float, i: int, out: FloatArray) -> None:
 
 @compiled
 def _invert(S: FloatArray, out: FloatArray) -> bool:
-    """Inverse of a symmetric positive definite (3, 3) matrix; False where it is singular to rounding."""
+    """Fill the inverse of a symmetric positive definite (3, 3) matrix; False if it is numerically singular."""
     first, second, third = _of(S, 0), _of(S, 1), _of(S, 2)
     rows = (cross(second, third), cross(third, first), cross(first, second))
     det = dot(first, rows[0])
@@ -414,7 +425,7 @@ def _invert(S: FloatArray, out: FloatArray) -> bool:
 def _add_reduced(
     D: FloatArray, e: FloatArray, inverse: FloatArray, Q: FloatArray, H: FloatArray, gradient: FloatArray
 ) -> None:
-    """Normal equations (6) without the point: H += Dt^T Dt - Q N^-1 Q^T with Q = Dt^T Dp."""
+    """Add normal equations (6) with the point eliminated: H += Dt^T Dt - Q N^-1 Q^T with Q = Dt^T Dp."""
     g = (_product(D[:, 0], e), _product(D[:, 1], e), _product(D[:, 2], e))
     best = apply(inverse, g)
     for i in range(6):
@@ -432,7 +443,7 @@ _VARIANCE = (0.5, 0.5, 2.0)
 
 @compiled
 def _predict(p: Vector, disparity: float, focal: FloatArray, by_p: FloatArray) -> Vector:
-    """Prediction, relative to the principal point; fills its derivative by_p (3, 3) by p."""
+    """Return the predicted m, relative to the principal point; fill its derivative by_p (3, 3) by p."""
     iz = 1.0 / p[2]
     m = (focal[0] * p[0] * iz, focal[1] * p[1] * iz, disparity * iz)
     by_p[0, 0], by_p[1, 1] = focal[0] * iz, focal[1] * iz
@@ -453,19 +464,19 @@ def track_terms(
     gradient: FloatArray,
     want: bool,
 ) -> None:
-    """Squared whitened errors of tracks, and the normal equations of half their sum.
+    """Compute squared whitened errors of tracks, and the normal equations of half their sum.
 
-    Tracks (n, 4, 9), whose four ends have times of their own, are those of ``timed_track_terms``.
+    Tracks (n, 4, 9), whose four ends have their own times, are passed to ``timed_track_terms``.
 
     Args:
         theta: (6,) w and v.
-        tracks: (n, 8) ray 0 (x, y) and disparity 0; x, y relative to the principal point and disparity of
-            frame 1, px; tau0, tau1. All of the camera halfway between both.
+        tracks: (n, 8), in the camera halfway between both: ray (x, y) and disparity (px) of frame 0; x, y relative
+            to the principal point and disparity of frame 1, px; tau0, tau1.
         focal: (2,) fx, fy in pixels; h: frame periods per row; baseline: metres.
         squares: (n,) filled, px^2: chi-squared with 3 degrees of freedom at a noise of 1 px.
         H, gradient: (6, 6), (6,), added to when ``want``.
     """
-    if tracks.ndim == 3:  # known when compiled: only what is called is
+    if tracks.ndim == 3:  # known at compile time, so that only one branch is compiled
         timed_track_terms(theta, kernel, tracks, focal, baseline, squares, H, gradient, want)
         return
     R, A, by_p, S, W = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
@@ -506,7 +517,7 @@ def apply_variance(a: Vector) -> Vector:
 
 @compiled
 def _whitening(D0: FloatArray, D1: FloatArray, S: FloatArray, W: FloatArray) -> bool:
-    """Fill the covariance S (3, 3) of the three equations and its inverse W; False when there is none."""
+    """Fill the covariance S (3, 3) of the three equations and its inverse W; False if S is singular."""
     for i in range(3):
         for j in range(i, 3):
             S[i, j] = 0.0
@@ -530,7 +541,10 @@ def _track_gradients(
     D0: FloatArray,
     D1: FloatArray,
 ) -> None:
-    """Derivatives (3, 3) of the three equations by m of frame 0 and of frame 1; rates are p's by the times."""
+    """Fill the derivatives D0, D1 (3, 3) of the three equations by m of frames 0 and 1.
+
+    ``rate0`` and ``rate1`` are the derivatives of p by the two times.
+    """
     by_x = (R[0, 0] / focal[0], R[1, 0] / focal[0], R[2, 0] / focal[0])
     by_y = (
         R[0, 1] / focal[1] + h * rate0[0],
@@ -612,16 +626,16 @@ def add_tracks(
     gradient: FloatArray,
     H: FloatArray,
 ) -> float:
-    """Negative log-likelihood of tracks times the squared scale, px^2; its gradient and Hessian are added to.
+    """Return the negative log-likelihood of tracks times the squared scale, px^2; add to gradient and Hessian.
 
     Args:
-        theta: (6,) of the motion.
+        theta: (6,) parameters of the motion.
         tracks: (n, 4, 9), see ``timed_track_terms``.
-        by: (n, 4, k, 3) derivatives of the ends' rays (x, y) and times by k unknowns.
+        by: (n, 4, k, 3) derivatives of the ends' rays (x, y) and times by k further unknowns.
         focal: (2,), px; baseline: metres.
         tails: (2,) degrees of freedom and scale, px, of the errors' t distribution.
         trust: (n,) factors on the log-likelihoods.
-        gradient, H: (6 + k,), (6 + k, 6 + k).
+        gradient, H: (6 + k,), (6 + k, 6 + k), added to.
     """
     size = len(gradient)
     e, D, W = np.zeros(8), np.zeros((8, 9)), np.zeros((4, 2, 2))
@@ -659,7 +673,7 @@ def add_tracks(
 
 @compiled
 def _fill_unknown(by: FloatArray, focal: FloatArray, work: FloatArray, W: FloatArray, out: FloatArray) -> None:
-    """Derivative (8,) of a track's whitened errors by one unknown, of which the ends have ``by`` (4, 3)."""
+    """Fill the derivative (8,) of a track's whitened errors by one unknown; ``by`` (4, 3) is that of its ends."""
     for i in range(4):
         x, y = focal[0] * by[i, 0], focal[1] * by[i, 1]
         if i > 0:
@@ -684,7 +698,11 @@ def _loss(square: float, freedom: float, tails: FloatArray, trust: float) -> flo
 
 @compiled
 def _weights(square: float, freedom: float, tails: FloatArray, trust: float) -> tuple[float, float]:
-    """Weights of a measurement in the gradient and in the Hessian (its mean second derivative over directions)."""
+    """Return the weights of a measurement in the gradient and in the Hessian.
+
+    The latter is the second derivative, averaged over directions of the residuals, but at least a tenth of the
+    former.
+    """
     variance = tails[1] * tails[1]
     weight = trust * (tails[0] + freedom) / (tails[0] + square / variance)
     bend = 2.0 * square / freedom / (tails[0] * variance + square)
@@ -703,7 +721,7 @@ def add_pairs(
     gradient: FloatArray,
     H: FloatArray,
 ) -> float:
-    """Like ``add_tracks``, for pairs (n, 17); ``by``: (n, 2, k, 3)."""
+    """Do the same as ``add_tracks`` for pairs (n, 17); ``by`` is (n, 2, k, 3)."""
     size = len(gradient)
     J, work, ends = np.zeros(size), np.zeros((4, 3, 3)), np.zeros(6)
     cost = 0.0
@@ -735,10 +753,12 @@ def linearise_pair(
     J: FloatArray,
     ends: FloatArray,
 ) -> tuple[float, float]:
-    """Sampson residual, px, of one pair (1, 17), and the norm of its constraint's derivative by the pixels.
+    """Return the Sampson residual, px, of one pair (1, 17) and the norm of its constraint's derivative by the
+    pixels.
 
-    Fills J (6 and more,) with the derivative of the constraint by the motion, and ``ends`` (6,) with that by ray
-    and time of either end, both at the corrected pair, see ``kernels``.
+    The first 6 elements of J are filled with the derivative of the constraint by the motion, ``ends`` (6,) with
+    that by the rays (x, y) and times of both ends. Both are evaluated at the corrected pair, see the top of this
+    module. Without translation neither is filled, and the norm is 0.
     """
     R, A, T_w, T_v = work[0], work[1], work[2], work[3]
     x, y, offset = (pairs[0, 0], pairs[0, 1], 1.0), (pairs[0, 2], pairs[0, 3], 1.0), pairs[0, 6]

@@ -1,4 +1,4 @@
-"""Motion from matches with outliers: one robust loop for all solvers."""
+"""Robust motion estimation from matches with outliers, with the same loop for all solvers."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ from rsbench.solvers.engine.packed import TRACK_FREEDOM, Packed, pack, pack_pair
 from rsbench.solvers.engine.ransac import IntArray, RansacOptions, SearchOptions, msac_score, ransac
 
 SIGMAS = 2.5
-"""Standard deviations of the noise at which a match is an outlier."""
+"""Error of a match, in standard deviations of the noise, above which it is an outlier."""
 _NEAR = 8.0
-"""Thresholds within which matches are given to a solver that weights them itself."""
+"""Largest error, in thresholds, of matches that are given to a solver that weights them itself."""
 _FIXED_POINT_STEPS = 8
 _GROUPS: tuple[MatchSet, ...] = ("left", "right", "tracks")
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatchCount:
-    """Number of matches that the solver used, and of those that its motion explains."""
+    """Number of matches that the solver used, and number of inliers among them."""
 
     inliers: int
     matches: int
 
 
 class RobustProblem:
-    """The data are the left pairs, the right pairs, and the tracks that the solver uses as such.
+    """Motion estimation as a RANSAC problem; data are left pairs, right pairs, and tracks if the solver uses them.
 
-    Each measurement is in them once. For a solver that needs left-right matches, a track is a match over time with
-    a left-right match at both ends; they are sampled together.
+    Each measurement occurs once. For a solver that needs left-right matches, a track is a match over time with a
+    left-right match at both ends; these are sampled together.
     """
 
     def __init__(
@@ -68,13 +68,13 @@ class RobustProblem:
         self.sample_size, self.linked = self._plan(linked)
         self._affine = "affine" in self.spec.needs
         self._unlinked = {side: unlinked_pairs(correspondences, side) for side in SIDES}
-        if self._affine:  # tracks have no affine frames: such a solver is given the left matches alone
+        if self._affine:  # tracks have no affine frames: such a solver gets only the left matches
             self._unlinked["left"] = np.full(len(correspondences.left), len(correspondences.affine) > 0)
         self.data = self._data()
         self.packed = self._packed()
 
     def _plan(self, linked: bool) -> tuple[tuple[int, int, int], bool]:
-        """Number of data of each group in a sample, and whether tracks are used as such."""
+        """Return the number of data of each group in a sample, and whether tracks are used as tracks."""
         given = self.given
         if not self._stereo:
             pairs = Correspondences(left=given.left, right=given.right)
@@ -89,7 +89,7 @@ class RobustProblem:
         return (max(left - least, 0), max(right - least, 0), least), True
 
     def _data(self) -> Correspondences:
-        """Each measurement once: tracks as tracks or as pairs, and the pairs that no track repeats."""
+        """Return each measurement once: tracks (or the pairs in them), and pairs that are not part of a track."""
         given = self.given
         pairs = {}
         for side in SIDES:
@@ -103,14 +103,14 @@ class RobustProblem:
         return Correspondences(**pairs, tracks=tracks, affine=affine)
 
     def _packed(self) -> Packed:
-        """The data under the shutter that the solver assumes, about the point whose motion it gives."""
+        """Pack the data with the shutter and the reference point that the solver assumes."""
         data, rig, shutter = self.data, self.rig, self.shutter
         model, own = self.spec.motion_model, self.spec.motion_parameters
         if self.spec.shutter == "global":
             shutter = shutter.at_once()
         if self.spec.reference_point == "body":
             return pack(data, rig, shutter, model, motion_parameters=own)
-        # The errors of tracks are about the body: the left camera's motion is judged by what that camera sees.
+        # Errors of tracks need the motion of the body. The left camera's motion is scored on its own pairs only.
         rig = rig.about("left")
         alone = Correspondences(left=data.left, right=data.right)
         packed = pack(alone, rig, shutter, model, motion_parameters=own)
@@ -136,12 +136,12 @@ class RobustProblem:
             packed = replace(packed, kernel=load_kernel(self.spec.motion_model, own))
         theta = packed.theta(model.w, model.d)
         squares = packed.track_squares(theta)
-        squares = np.where(squares >= 0.0, squares, np.inf)  # a point next to a camera's plane overflows
+        squares = np.where(squares >= 0.0, squares, np.inf)  # overflow for a point next to the plane z = 0
         return np.concatenate([packed.pair_residuals(theta), np.sqrt(squares) * _track_scale()])
 
     @property
     def shortage(self) -> str:
-        """What is missing for a minimal sample; empty if nothing is."""
+        """Message about the matches missing for a minimal sample; empty if there are enough."""
         names = dict(zip(_GROUPS, ("left matches", "right matches", "tracks"), strict=True))
         if self._affine:
             names["left"] = "left matches with affine frames"
@@ -156,15 +156,15 @@ class RobustProblem:
         return "; ".join(short)
 
     def failure(self, reason: str) -> str:
-        """The reason of a failure, with the most frequent one that the solver returned for samples."""
+        """Return the reason of a failure, with the most frequent failure of the solver on samples."""
         most_often = "".join(f"; most frequent failure: {text}" for text, _ in self.reasons.most_common(1))
         return f"{self.shortage or reason}{most_often}"
 
     def noise_threshold(self, model: MotionEstimate, threshold: float) -> float:
-        """Threshold at 2.5 standard deviations of the noise that the residuals below it show.
+        """Return the threshold that is 2.5 standard deviations of the noise, estimated from residuals below it.
 
-        A fixed point of: noise from the residuals below the threshold (a truncated distribution), threshold from
-        the noise. Outliers are too sparse to affect it.
+        Fixed-point iteration alternates between the noise, from the residuals below the threshold (a truncated
+        distribution), and the threshold, from the noise. Outliers are too sparse to affect it.
         """
         squares = self.residuals(model) ** 2
         tracks = len(self.packed.tracks)
@@ -182,19 +182,19 @@ class RobustProblem:
         return estimate if estimate.success else None
 
     def weigh(self, model: MotionEstimate, threshold: float) -> MotionEstimate | None:
-        """The motion from all matches near a model, of a solver that weighs matches itself."""
+        """Return the motion from all matches near a model if the solver weights matches itself, else None."""
         near = np.flatnonzero(np.abs(self.residuals(model)) <= _NEAR * threshold)
         found = self.solver.weigh(model, self._subset(near), self.rig, self.shutter, threshold / SIGMAS)
         return found if found is not None and found.success else None
 
     def conclude(self, model: MotionEstimate, inliers: BoolArray) -> MotionEstimate:
-        """The solver on all inliers; the model itself when the solver fails there."""
+        """Run the solver on all inliers; return the given model if the solver fails."""
         subset = self._subset(np.flatnonzero(inliers))
         estimate = self.solver.improve(model, subset, self.rig, self.shutter)
         return estimate if estimate.success else model
 
     def on_all(self) -> MotionEstimate:
-        """The solver's own estimate from all matches."""
+        """Run the solver on all matches."""
         data = self.data
         everything = self._handed(data.left, data.right, data.tracks) if self._stereo else self.given
         return self.solver.estimate(everything, self.rig, self.shutter)
@@ -212,7 +212,10 @@ class RobustProblem:
     def _handed(
         self, left: FloatArray, right: FloatArray, tracks: FloatArray, affine: FloatArray | None = None
     ) -> Correspondences:
-        """Matches as the solver needs them: tracks as they are, or as matches that end in left-right matches."""
+        """Return matches in the form that the solver needs.
+
+        If it needs left-right matches, tracks are split into left-right matches and matches over time.
+        """
         if not self._stereo:
             frames = {} if affine is None else {"affine": affine}
             return Correspondences(left=left, right=right, tracks=tracks, **frames, **self._sensed)
@@ -228,11 +231,11 @@ class RobustProblem:
 
     @property
     def _sensed(self) -> dict[str, FloatArray]:
-        """Samples of other sensors, all of them."""
+        """All samples of other sensors."""
         return {name: getattr(self.given, name) for name in SENSORS}
 
     def counts(self, inliers: BoolArray) -> dict[MatchSet, MatchCount]:
-        """Inliers and matches of each group of data."""
+        """Return the number of inliers and matches in each group of data."""
         parts = np.split(inliers, np.cumsum(self.num_data)[:-1])
         return {
             name: MatchCount(inliers=int(np.count_nonzero(part)), matches=len(part))
@@ -240,7 +243,7 @@ class RobustProblem:
         }
 
     def masks(self, inliers: BoolArray) -> dict[MatchSet, BoolArray]:
-        """Inliers of the given sets: a match that a track repeats is one if the track is."""
+        """Return inlier masks over the given sets; a match in a track is an inlier if the track is."""
         *pairs, tracks = np.split(inliers, np.cumsum(self.num_data)[:-1])
         out: dict[MatchSet, BoolArray] = {}
         as_pairs = np.ones(len(self.given.tracks), dtype=np.bool_)
@@ -264,48 +267,51 @@ class RobustProblem:
 
 @functools.cache
 def quantile(freedom: int) -> float:
-    """Quantile of chi-squared at the probability that a normal variable lies within 2.5 standard deviations."""
+    """Return the chi-squared quantile at the probability that a normal variable is within 2.5 sigma."""
     return float(2.0 * scipy.special.gammaincinv(0.5 * freedom, float(scipy.special.chdtr(1, SIGMAS**2))))
 
 
 @functools.cache
 def _track_scale() -> float:
-    """Factor that gives the root of a track's squared error the quantile of a pair's error at 2.5 sigma."""
+    """Return the factor on the root of a track's squared error that makes one threshold fit tracks and pairs.
+
+    After scaling, the same proportion of tracks and of pairs lies within 2.5 sigma.
+    """
     return SIGMAS / float(np.sqrt(quantile(TRACK_FREEDOM)))
 
 
 @functools.cache
 def truncated(freedom: int) -> float:
-    """Mean of chi-squared below ``quantile``."""
+    """Return the mean of a chi-squared variable truncated at ``quantile``."""
     chdtr = scipy.special.chdtr
     return float(freedom * chdtr(freedom + 2, quantile(freedom)) / chdtr(freedom, quantile(freedom)))
 
 
 def _moment(freedom: int) -> float:
-    """Mean square of a scaled residual below its threshold, at a noise of 1 px."""
+    """Return the mean square of a scaled residual below its threshold, for a noise of 1 px."""
     return truncated(freedom) * SIGMAS**2 / quantile(freedom)
 
 
 SECOND_TRY = 3.0
-"""Factor on the threshold after a search without result."""
+"""Factor on the threshold in a second attempt after a search without result."""
 _ADAPTATIONS = 2
 _WORSE = 1.5
-"""Largest cost of the refined motion, at the adapted threshold, over that of the search's result (at least one
-datum's), which is else kept. On rendered frames more accurate motions cost up to 1.3 times as much; refits of
-solvers that are sensitive to noise cost 1.7 times as much and more."""
+"""Largest ratio of the MSAC cost of the refined motion to that of the search's result (at least 1), both at the
+adapted threshold; above it, the search's result is kept. On rendered frames, more accurate motions cost up to 1.3
+times as much; refits of solvers that are sensitive to noise cost 1.7 times as much and more."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobustOptions(SearchOptions):
-    """The robust loop, equal for every solver."""
+    """Options of the robust loop, which are the same for every solver."""
 
     threshold_px: float = 1.25
     """Largest Sampson error of an inlier: 2.5 standard deviations of a match's noise of 0.5 px."""
     adapt_threshold: bool = True
-    """Whether the threshold then follows the noise that the inliers show, between a fifth and four times it."""
+    """Whether the threshold is then adapted to the inliers' noise, to between 0.2 and 4 times ``threshold_px``."""
 
     def ransac(self) -> RansacOptions:
-        """The options of the search; checks the values."""
+        """Return the options of the search, which checks their values."""
         same = {each.name: getattr(self, each.name) for each in fields(SearchOptions)}
         return RansacOptions(threshold=self.threshold_px, **same)
 
@@ -315,32 +321,33 @@ class RobustOptions(SearchOptions):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RobustEstimate:
-    """A motion, and the matches that it explains."""
+    """A motion and its inliers."""
 
     estimate: MotionEstimate
     inliers: dict[MatchSet, BoolArray] = field(default_factory=dict)
-    """Masks over ``left``, ``right`` and ``tracks``; all False after a failure. Points that sets repeat are
-    counted twice in their sum, but not in ``counts``."""
+    """Masks over ``left``, ``right`` and ``tracks``; all False after a failure. A point that is in several sets
+    counts in each of these masks, but only once in ``counts``."""
     counts: dict[MatchSet, MatchCount] = field(default_factory=dict)
-    """Counts of matches that the solver uses, each once: ``tracks``, and under ``left`` and ``right`` the pairs
-    that no track repeats. For a solver of pairs a track is a left and a right pair."""
+    """Counts of the matches that the solver uses, each counted once: ``tracks``, and under ``left`` and ``right``
+    the pairs that are not part of a track. For a solver that uses only pairs, a track counts as a left and a right
+    pair."""
     iterations: int
     seconds: float
     threshold_px: float
-    """The threshold of the inliers."""
+    """Threshold below which matches are inliers."""
     reference_point: Literal["body", "left"] = "body"
-    """The point of the rig whose translation the estimate gives: that of its solver's spec."""
+    """The point of the rig whose translation is estimated, from the solver's spec."""
     motion_model: str = ""
-    """The chosen motion model; empty: the one that the solver assumes."""
+    """The selected motion model; empty for the one that the solver assumes."""
 
     @property
     def inlier_count(self) -> int:
-        """Matches that the motion explains, each counted once; at most ``match_count``."""
+        """Number of inliers, each counted once; at most ``match_count``."""
         return sum(count.inliers for count in self.counts.values())
 
     @property
     def match_count(self) -> int:
-        """Matches that the solver used, each counted once."""
+        """Number of matches that the solver used, each counted once."""
         return sum(count.matches for count in self.counts.values())
 
 
@@ -353,22 +360,22 @@ def estimate_motion(
     rng: np.random.Generator,
     loop: Literal["ransac", "own"] = "ransac",
 ) -> RobustEstimate:
-    """Robust motion from matches with outliers.
+    """Estimate the motion robustly from matches with outliers.
 
-    A rolling-shutter solver's inliers have a small exact rolling-shutter Sampson error, a global-shutter one's a
-    small ordinary one (of the camera that it describes). A track's error includes all its information on the
-    motion, scaled so that one threshold rejects as many right tracks as right pairs. Too few matches or no
-    consensus is a failed estimate with the reason.
+    Inliers are matches with a small Sampson error: the exact rolling-shutter error for a rolling-shutter solver,
+    the ordinary one for a global-shutter solver (both for the camera or body whose motion it estimates). A track's
+    error uses all four of its pixels and is scaled so that one threshold rejects the same proportion of true
+    tracks and true pairs. If there are too few matches, no consensus, or cameras that the solver does not support,
+    the estimate is a failed one with the reason.
 
-    A global-shutter solver is given the matches as an ideal rig would have them, unless it supports any rig. A
-    solver that does not support the cameras gives a failure with the reason.
+    A global-shutter solver is given the matches as an ideal rig would see them, unless it supports any rig.
 
-    Left-right matches are used as parts of tracks; if no tracks are given, they are joined to tracks
-    (``join_stereo``).
+    Left-right matches are used as parts of tracks; if no tracks are given, left-right matches and matches over
+    time are joined to tracks (``join_stereo``).
 
     Args:
-        loop: ``own`` (``robust`` in a solver's card): the solver rejects outliers itself. It is given all
-            matches once; its inliers are those that its motion explains.
+        loop: ``ransac``, or ``own`` for a solver that rejects outliers itself (``robust`` in its card). It is then
+            called once with all matches; the inliers are those of its motion.
     """
     given, note = correspondences, ""
     if len(given.tracks) == 0 and len(given.stereo_0) + len(given.stereo_1) > 0:
@@ -400,10 +407,10 @@ def estimate_motion(
 def inputs_of(
     spec: SolverSpec, matches: Correspondences, rig: StereoRig, shutter: RollingShutter
 ) -> tuple[Correspondences, StereoRig, RollingShutter]:
-    """The matches and cameras that a solver is given: see ``SolverSpec.cameras``.
+    """Return the matches and cameras that a solver is given, see ``SolverSpec.cameras``.
 
     Raises:
-        ValueError: it does not support the cameras, or the lens of one shows no ray at a match.
+        ValueError: it does not support the cameras, or a match lies at a pixel for which the lens has no ray.
     """
     ideal = without_lens(matches, rig)
     if refusal := spec.refusal(rig, shutter):
@@ -418,7 +425,7 @@ def inputs_of(
 def _refused(
     correspondences: Correspondences, reason: str, solver: Solver, options: RobustOptions
 ) -> RobustEstimate:
-    """The failure of a solver that is not run."""
+    """Return a failed estimate for a solver that was not run."""
     return RobustEstimate(
         estimate=MotionEstimate.failed(reason),
         inliers={name: np.zeros(len(getattr(correspondences, name)), dtype=np.bool_) for name in _GROUPS},
@@ -430,7 +437,7 @@ def _refused(
 
 
 class _Found(NamedTuple):
-    """A motion of a problem, and which of its data it explains."""
+    """A motion and its inliers among the data of a problem."""
 
     problem: RobustProblem
     estimate: MotionEstimate
@@ -440,7 +447,7 @@ class _Found(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """Matches, cameras, the solver and the options of its search."""
+    """Input of the robust loop: matches, cameras, solver and options."""
 
     matches: Correspondences
     rig: StereoRig
@@ -449,7 +456,7 @@ class _Task(NamedTuple):
     options: RobustOptions
 
     def by_ransac(self, rng: np.random.Generator) -> _Found:
-        """The motion by RANSAC around the solver."""
+        """Estimate the motion by RANSAC with the solver."""
         failed, iterations, options = None, 0, self.options
         for problem, threshold in self._attempts():
             report = ransac(problem, replace(options, threshold_px=threshold).ransac(), rng)
@@ -463,7 +470,7 @@ class _Task(NamedTuple):
         return failed
 
     def by_solver(self) -> _Found:
-        """The motion by the solver alone, which rejects outliers itself."""
+        """Estimate the motion by the solver alone, which rejects outliers itself."""
         problem, threshold = RobustProblem(*self[:4]), self.options.threshold_px
         estimate = problem.on_all()
         if not estimate.success:
@@ -473,14 +480,14 @@ class _Task(NamedTuple):
         return _Found(problem, estimate, np.abs(problem.residuals(estimate)) <= threshold, threshold, 0)
 
     def _attempts(self) -> Iterator[tuple[RobustProblem, float]]:
-        """Problems and thresholds to try until one gives a motion."""
+        """Yield problems and thresholds to try until one gives a motion."""
         problem, threshold = RobustProblem(*self[:4]), self.options.threshold_px
         yield problem, threshold
         if problem.linked and len(problem.packed.pairs) > len(problem.packed.tracks):
-            # If left-right matches are mostly wrong, those over time may still be right.
+            # Even if most left-right matches are outliers, matches over time may be inliers.
             yield RobustProblem(*self[:4], linked=False), threshold
         if self.options.adapt_threshold and not problem.shortage:
-            # Noise far above the threshold scatters the inliers of any model.
+            # If the noise is far above the threshold, even the right model has few inliers.
             yield problem, SECOND_TRY * threshold
 
 
@@ -491,7 +498,7 @@ def _conclude(
     threshold: float,
     options: RobustOptions,
 ) -> tuple[MotionEstimate, BoolArray, float]:
-    """The solver's motion from all matches near or from all inliers, the matches that it explains, and their
+    """Return the final motion, from all matches near the model or from its inliers, with its inliers and
     threshold."""
     final = problem.weigh(model, threshold)
     if final is not None:
@@ -509,18 +516,18 @@ def _conclude(
     if not knows_less and _cost(problem, final, threshold) > _WORSE * max(
         _cost(problem, found[0], threshold), 1.0
     ):
-        # The solver is worse with more matches: the result of the search is kept.
+        # If the solver fits worse with more matches, the result of the search is kept.
         return found
     return final, np.abs(problem.residuals(final)) <= threshold, threshold
 
 
 def _cost(problem: RobustProblem, model: MotionEstimate, threshold: float) -> float:
-    """The MSAC cost, which the search minimises."""
+    """Return the MSAC cost, which the search minimises."""
     errors = np.abs(problem.residuals(model))
     return msac_score(np.where(np.isnan(errors), np.inf, errors), threshold)
 
 
 def _adapted(problem: RobustProblem, model: MotionEstimate, threshold: float, options: RobustOptions) -> float:
-    """The threshold that fits the noise of a model's inliers, between a fifth and four times the requested one."""
+    """Adapt the threshold to the noise of a model's inliers, to between 0.2 and 4 times the requested one."""
     least, most = 0.2 * options.threshold_px, 4.0 * options.threshold_px
     return float(np.clip(problem.noise_threshold(model, threshold), least, most))
