@@ -78,7 +78,8 @@ class CorrectedFrames:
     at_rows: list[dict[View, Fused]]
     """The frames corrected to each of the further target rows."""
     seconds: dict[str, float]
-    """Duration of each of ``STEPS``; matching includes the estimate of the capture."""
+    """Duration of each of ``STEPS``; matching includes the estimate of the capture, and stereo matching runs
+    beside the motion."""
 
     @property
     def rig(self) -> StereoRig:
