@@ -303,3 +303,17 @@ def test_disparities_below_their_noise_state_no_deviation() -> None:
         found = RefinedSolver().estimate(c, rig, shutter)
         assert found.success and (found.covariance is None) == refused
         assert ("smaller than their noise" in found.reason) == refused
+
+
+def test_negative_disparities_determine_no_direction() -> None:
+    """Points beyond infinity and the opposite motion would explain them as well."""
+    motion = LinearMotion(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.3]))
+    matches = matches_of(motion, tracks=80, noise_px=0.1)
+    estimate = RefinedSolver().estimate(matches, RIG, SHUTTER)
+    assert estimate.direction_known and estimate.covariance is not None
+    disparities = matches.tracks[:, [0, 4]] - matches.tracks[:, [2, 6]]
+    tracks = matches.tracks.copy()
+    tracks[:, [2, 6]] += 2.0 * disparities
+    beyond = RefinedSolver().estimate(replace(matches, tracks=tracks), RIG, SHUTTER)
+    assert not beyond.direction_known and "calibrate the rig again" in beyond.reason
+    assert beyond.covariance is None
