@@ -431,7 +431,8 @@ def estimate_trajectory(
         ``motion``, with ``body_from_world(tau)`` at any time, frame periods; the world is the body at time 0.
         ``covariance(tau)`` and ``covariance_between(start, tau)`` (n, 6, 6) of small rotations about the body's
         axes, radians, and of its position, metres. ``shutter``; ``noise_px``. For each window ``inliers``, and
-        ``supported``: False if too few of its matches agree and the spline is interpolated. ``gyro``, with
+        ``supported``: False if too few of its matches agree and the spline is interpolated; ``depths``: False if
+        disparities are below their noise, so that the covariances do not hold. ``gyro``, with
         ``bias``, ``shift``, ``matrix``, ``noise`` and ``used``, which is False if it contradicts the matches.
 
     Raises:

@@ -112,6 +112,8 @@ class Trajectory:
     """For each window, which of its tracks are inliers."""
     supported: BoolArray
     """(windows,) whether a window's own tracks support it; the others are interpolated by the spline."""
+    depths: BoolArray
+    """(windows,) whether disparities exceed their noise; otherwise the covariances do not describe the errors."""
     fit: Fit
     covariance_band: FloatArray
     """Covariance of the control poses, see ``trajectory_spline``."""
@@ -186,6 +188,7 @@ def estimate_trajectory(
         prior=found.prior,
         inliers=inliers,
         supported=np.array([is_supported(mask, found.tails) for mask in inliers]),
+        depths=_depths(found, tracks, inliers, rig),
         fit=found,
         covariance_band=covariance_band(found, tracks),
         gyro=state.gyro_found(found),
@@ -201,6 +204,17 @@ def is_supported(inliers: BoolArray, tails: Tails) -> bool:
     """Whether the inliers among tracks (n,) suffice to support their window."""
     enough = np.count_nonzero(inliers) >= max(_FEWEST, _LEAST_SHARE * len(inliers))
     return bool(enough and noise_px(tails) <= MOST_NOISE_PX)
+
+
+def _depths(found: Fit, tracks: TimedTracks, inliers: Sequence[BoolArray], rig: StereoRig) -> BoolArray:
+    """Return for each window whether the median disparity of its inliers (m,) exceeds the noise, see
+    ``LEAST_DEPTHS``; true without inliers."""
+    disparities = (
+        rig.camera.fx * rig.baseline * inverse_depths(found.curve, tracks.ends, tracks.starts, tracks.focal)
+    )
+    least = LEAST_DEPTHS * np.sqrt(2.0) * noise_px(found.tails)
+    seen = [disparities[own[: len(mask)][mask]] for own, mask in zip(tracks.members, inliers, strict=True)]
+    return np.array([len(each) == 0 or bool(np.median(each) >= least) for each in seen])
 
 
 # Streams
@@ -366,13 +380,9 @@ class _State:
         right = [found.trust[members][: len(each.tracks)] > 0.0 for members, each in pairs]
         own = [self.first + k for k, each in enumerate(right) if is_supported(each, found.tails)]
         supported = [self._supported, *own]
-        rho = inverse_depths(found.curve, tracks.ends, tracks.starts, tracks.focal)
-        disparities = self.rig.camera.fx * self.rig.baseline * rho
-        least = LEAST_DEPTHS * np.sqrt(2.0) * noise_px(found.tails)
+        seen = _depths(found, tracks, right, self.rig)
         for number in range(self.first, self.first + count):
-            inliers = right[number - self.first]
-            seen = disparities[tracks.members[number - self.first][: len(inliers)][inliers]]
-            depths = bool(len(seen) == 0 or np.median(seen) >= least)
+            inliers, depths = right[number - self.first], bool(seen[number - self.first])
             yield StreamedWindow(
                 number=number,
                 motion=ContinuousMotion.of(part(found.curve, number + start, number + end, float(number))),

@@ -35,7 +35,7 @@ def masked(image: Image, mask: NDArray[np.bool_]) -> Image:
     return np.where(mask[..., None], image, np.array(INVALID, dtype=np.uint8))
 
 
-_MAPS = {"viridis": cv2.COLORMAP_VIRIDIS, "magma": cv2.COLORMAP_MAGMA, "inferno": cv2.COLORMAP_INFERNO}
+_MAPS = {"viridis": cv2.COLORMAP_VIRIDIS, "inferno": cv2.COLORMAP_INFERNO}
 
 
 def colour_map(values: ArrayLike, low: float, high: float, name: str = "viridis") -> Image:

@@ -2,8 +2,7 @@
 
 Minimal samples of a robust search have three tracks or, without tracks, five matches of one camera, for which all
 solutions with a small rotation are found. To first order in w, the exact constraint of the paper's motion is
-linear
-in d, with coefficients that are linear in w:
+linear in d, with coefficients that are linear in w:
 
     m(w) . d = 0,   m(w) = c + (a (x y^T - (x.y) I) - k1 [c]x) w,   c = x cross y, a = k3 - k1
 
@@ -141,8 +140,8 @@ _NEARLY_PLANAR = 0.15
 that are not planar it is 0.2 and more."""
 LEAST_DEPTHS = 0.7
 """Smallest ratio of the median disparity to its standard deviation for which a covariance is stated. Below it,
-errors of
-a point are not described by a linearisation: only half of the stated 95 % ellipsoids contained the truth."""
+errors of a point are not described by a linearisation: only half of the stated 95 % ellipsoids contained the
+truth."""
 NO_DEPTHS = "no deviation can be stated: disparities are smaller than their noise"
 _LEAST_NOISE_PX = 0.01
 """Lower bound of the noise, px, in tests of what data determine; exact data have no residuals."""

@@ -265,3 +265,4 @@ def test_points_are_not_beyond_infinity(depths: tuple[float, float], speed: floa
     for each in stream_trajectory(converging, RIG, SHUTTER):
         assert each.motion.d[2] < 0.0
         assert each.depths == (each.covariance is not None) == (depths[0] < 10.0)
+    assert np.all(estimate_trajectory(converging, RIG, SHUTTER).depths == (depths[0] < 10.0))

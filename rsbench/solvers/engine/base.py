@@ -35,9 +35,8 @@ from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
 
 MatchSet = Literal["left", "right", "stereo", "tracks", "affine", "gyro", "gravity"]
-"""Sets of matches, affine frames of the left matches (one row each), and samples of other sensors. The latter are
-not
-sampled by RANSAC: a solver always gets all of them."""
+"""Sets of matches, affine frames of the left matches (one row each), and samples of other sensors. RANSAC does
+not draw from the latter: a solver always gets all of them."""
 SENSORS: Mapping[MatchSet, str] = {"gyro": "samples of a gyroscope", "gravity": "directions of gravity"}
 """Sets of samples of other sensors."""
 Cameras = Literal["ideal", "lens", "any", "rig"]
@@ -379,9 +378,8 @@ def solver(
         function: returns ``w`` (3,), the rotation vector in rad, and ``d`` (3,), the translation of the reference
             point, both over one frame period: ``X_body = exp([w]x) X_world + d``.
         needs: the sets of matches that it uses.
-        minimum: smallest number of matches in every set, or by name of the set; RANSAC draws samples of this size.
-        If
-            it is one number, it does not apply to samples of sensors, of which two are then needed.
+        minimum: smallest number of matches in every set, or by name of the set; RANSAC draws samples of this
+            size. If it is one number, it does not apply to samples of sensors, of which two are then needed.
         metric: whether d is in metres.
         motion_model, shutter, reference_point, cameras, reference: see ``SolverSpec``.
         robust, code, tuned_on: see ``SolverOptions``; a card may set them too.
