@@ -162,8 +162,8 @@ _COLOURS = {
     Origin.HERE: (225, 228, 230),
 }
 _LEGEND = {
-    Origin.HERE: "seen in this frame",
-    Origin.GUESSED: "seen in this frame, depth guessed from neighbours",
+    Origin.HERE: "visible in this frame",
+    Origin.GUESSED: "visible in this frame, depth guessed from neighbours",
     Origin.OTHER_CAMERA: "from the other camera",
     Origin.OTHER_FRAME: "from the other frame",
     Origin.INVENTED: "visible in no frame, filled from its surroundings",
