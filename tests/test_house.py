@@ -19,7 +19,6 @@ from commands import install_project, run_here
 from documents import ROOT, blocks, write_blocks
 from programs import run_python
 
-import rsbench
 from rsbench.benchmark.simulated.contract import CHECKS, check_solver
 from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
 from rsbench.components.cards import CardKind, list_cards, read_toml
@@ -28,6 +27,7 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
+from rsbench.core.version import RELEASE
 from rsbench.dataset.card import load_dataset_card
 from rsbench.solvers.engine.base import list_solvers, load_solver_entry
 
@@ -335,10 +335,6 @@ def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
 # Packaging
 
 
-def test_the_changelog_knows_this_version() -> None:
-    assert f"## [{rsbench.__version__}]" in (ROOT / "CHANGELOG.md").read_text("utf-8")
-
-
 def test_badges_and_citation_tell_what_the_package_says() -> None:
     readme = (ROOT / "README.md").read_text("utf-8")
     project = read_toml(ROOT / "pyproject.toml")["project"]
@@ -351,7 +347,7 @@ def test_badges_and_citation_tell_what_the_package_says() -> None:
         (shown,) = re.findall(rf"^  {bibtex} *= \{{+(.*?)\}}+,?$", entry, re.MULTILINE)
         (stated,) = re.findall(rf"^{cff}: \"?(.*?)\"?$", citation, re.MULTILINE)
         assert shown == stated
-    assert rsbench.__version__ in entry
+    assert RELEASE in entry
 
 
 def test_the_documented_card_is_one(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from markdown_it import MarkdownIt
 
 import rsbench
 from rsbench.components.cards import CardKind, list_cards
-from rsbench.core.version import RELEASED
+from rsbench.core.version import RELEASE, RELEASED
 from rsbench.verification.digests import references
 
 ROOT = Path(__file__).parents[1]
@@ -98,7 +98,7 @@ def test_the_metadata_say_what_an_index_shows(built: Built) -> None:
         assert (ROOT / path).is_file(), (kind, path)
 
 
-def test_version_and_day_are_those_of_citation_and_changelog() -> None:
+def test_release_and_day_are_those_of_citation_and_changelog() -> None:
     citation, changes = (ROOT / "CITATION.cff").read_text("utf-8"), (ROOT / "CHANGELOG.md").read_text("utf-8")
-    assert f"\nversion: {rsbench.__version__}\ndate-released: {RELEASED}\n" in citation
-    assert re.findall(r"^## \[(.*?)\] - (.*)$", changes, re.MULTILINE)[0] == (rsbench.__version__, RELEASED)
+    assert f"\nversion: {RELEASE}\ndate-released: {RELEASED}\n" in citation
+    assert re.findall(r"^## \[(.*?)\] - (.*)$", changes, re.MULTILINE)[0] == (RELEASE, RELEASED)
