@@ -26,7 +26,7 @@ Scheduler = Annotated[
 
 
 def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1) -> Workers:
-    """Processes on this machine, or a cluster.
+    """Return the number of processes on this machine, or the cluster of a scheduler.
 
     Raises:
         RsbenchError: both are given, distributed is not installed, or the scheduler file is missing.
@@ -39,11 +39,11 @@ def chosen_workers(workers: int | None, scheduler: str | None, default: int = 1)
         raise RsbenchError(
             f"--workers {workers}: the cluster of --scheduler {scheduler} has its own; give one of the two"
         )
-    if find_spec("distributed") is None:  # before scenes are built
+    if find_spec("distributed") is None:  # refused before scenes are built
         raise RsbenchError("--scheduler needs distributed: pip install 'rsbench[cluster]'")
     if not scheduler.endswith(".json"):
         return Cluster(address=scheduler)
-    if not Path(scheduler).is_file():  # distributed would wait for it without end
+    if not Path(scheduler).is_file():  # distributed would wait for the file forever
         raise RsbenchError(
             f"--scheduler {scheduler}: no such file; make it with: dask scheduler --scheduler-file {scheduler}"
         )
@@ -54,7 +54,7 @@ _Place = TypeVar("_Place", Path, Path | str)
 
 
 def shared_path(path: _Place, scheduler: str | None) -> _Place:
-    """An absolute path for the machines of a cluster, whose working folders differ; a URL stays unchanged."""
+    """Return an absolute path for the machines of a cluster, whose working folders differ; URLs stay unchanged."""
     if scheduler is None or isinstance(path, str):
         return path
     from rsbench.storage.work_folder import refuse_url
@@ -65,10 +65,10 @@ def shared_path(path: _Place, scheduler: str | None) -> _Place:
 
 @contextmanager
 def results_at(out: str, scheduler: str | None) -> Iterator[Path]:
-    """The folder into which a command writes: ``out``, or one whose files are copied to the URL ``out``.
+    """Yield the folder into which a command writes: ``out``, or one whose files are copied to the URL ``out``.
 
     Raises:
-        RsbenchError: a URL that is not supported, or a URL with a cluster; see ``mirrored``.
+        RsbenchError: the URL is not supported, or given with a cluster; see ``mirrored``.
     """
     from rsbench.storage.object_store import path_or_url, shown
 

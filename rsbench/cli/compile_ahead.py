@@ -1,8 +1,9 @@
-"""The first use of an installation: a second process compiles what ``correct`` needs, in another order.
+"""Faster first use of an installation: a second process compiles the functions of ``correct`` in another order.
 
 The command compiles functions in the order of their first calls. Half of the time is spent on the motion, whose
 spline comes last, so the second process begins with the spline, continues with depth and correction, and ends with
-the rest. Each loads from the cache on disk what the other has compiled (``rsbench.components.compiled``).
+the rest. Each process loads functions that the other has compiled from the cache on disk
+(``rsbench.components.compiled``).
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def compiling_ahead(*, to_the_end: bool = False) -> Iterator[None]:
     """Compile in a second process while the body runs, if nothing is compiled yet and there are two cores.
 
     Args:
-        to_the_end: the second process goes on after the body, until all is compiled, unless this one is killed.
+        to_the_end: whether the second process goes on after the body, until everything is compiled.
     """
     folder = cache_folder()
     compiled = folder is None or any(folder.glob("*.nbi")) or shipped_folder() is not None
@@ -55,26 +56,26 @@ def compiling_ahead(*, to_the_end: bool = False) -> Iterator[None]:
         yield
         return
     with lifeline() as line:
-        with suppress(OSError):  # no second process: the command compiles alone
+        with suppress(OSError):  # without a second process, the command compiles alone
             start_child(_COMMAND, line=line)
         yield
 
 
 def compile_all(line: int) -> None:
-    """Run the parts of the chain on small images; ends with the parent if there is a ``line`` to it."""
+    """Run the parts of the chain on small images; ``line``: see ``end_with``, or -1 to outlive the parent."""
     if _POSIX and line >= 0:
         end_with(line)
-    gc.disable()  # compiling makes many lasting objects; collecting garbage would take a twentieth of the time
+    gc.disable()  # compilation makes many lasting objects; garbage collection would take a twentieth of the time
     for part in parts():
         with suppress(Exception):  # the command meets the same error and reports it
             part()
 
 
 def compile_now(step: Callable[[str], None]) -> Path | None:
-    """Compile everything in two processes, and return the folder of the code; None where none can be kept.
+    """Compile everything in two processes, and return the cache folder; None if no folder is writable.
 
     Args:
-        step: called with the name of each of the ``PARTS`` when it is compiled.
+        step: called with each name of ``PARTS`` when this part is compiled.
     """
     with lifeline() as line:
         with suppress(OSError):
@@ -89,7 +90,7 @@ def compile_portable() -> None:
     """Compile everything for ``PORTABLE_CPU`` into the folder of the package, in another process.
 
     Raises:
-        RsbenchError: the folder cannot be written, or this is no such processor.
+        RsbenchError: the folder cannot be written, or this processor cannot run such code.
     """
     if not runs_portable_code():
         raise RsbenchError(f"compile --portable: this processor cannot run code for {PORTABLE_CPU}")
@@ -111,7 +112,7 @@ PARTS = ("spline", "depth", "correction", "motion", "matching")
 
 
 def parts() -> list[Callable[[], object]]:
-    """Calls that compile the spline, depth, correction, motion and matching, in this order."""
+    """Return functions whose calls compile spline, depth, correction, motion and matching, in this order."""
     from rsbench.benchmark.simulated.simulation import SimulationOptions, simulate
     from rsbench.capture.hypotheses import KnownInputs
     from rsbench.capture.two_frame_spline import two_frame_spline
@@ -132,7 +133,7 @@ def parts() -> list[Callable[[], object]]:
     known = KnownInputs(readout_ratio=shutter.readout_ratio)
     few = SimulationOptions(pairs=80, tracks=80, noise_px=0.1)
     shaken = SplineMotion([0.03, 0.05, 0.0], [0.1, 0.0, 0.2], preset="handheld")
-    # Two motion models, and a shake that needs a spline.
+    # Matches under two motion models, and under vibrations that need a spline.
     straight, turning, shaking = (
         simulate(rig, shutter, each, few, np.random.default_rng(0)).correspondences
         for each in (motion, InertialMotion([0.05, 0.12, 0.05], [0.1, 0.0, 0.2]), shaken)

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
 _GAP = 2
-"""Cells between columns."""
+"""Character cells between columns."""
 _quiet = False
 
 
 def be_quiet(quiet: bool) -> None:
-    """``--quiet``: no progress, tables or notes; results, their paths and errors stay."""
+    """Set whether progress, tables and notes are left out (``--quiet``); results, paths and errors are printed."""
     global _quiet
     _quiet = quiet
 
@@ -62,9 +62,9 @@ def print_answers(
     good: str,
     show: Callable[[list[dict[str, Any]]], None],
 ) -> None:
-    """Print an answer for each input: as JSON when it comes, or all together by ``show``; errors on stderr.
+    """Print each answer as JSON when it is ready, or all at the end by ``show``; print errors on stderr.
 
-    Exit code 2 where an input is wrong, 1 where the value of an answer at the key ``good`` is false.
+    The exit code is 2 if an input is invalid, 1 if the value of an answer at the key ``good`` is false.
     """
     answers, code = list[dict[str, Any]](), 0
     for answer in found:
@@ -96,7 +96,7 @@ def _progress(
 
 @contextmanager
 def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
-    """A progress bar on stderr; the yielded function advances it by one step and shows a word."""
+    """Show a progress bar on stderr; the yielded function advances it by one step and shows a word."""
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
     left = (TextColumn("left"), TimeRemainingColumn())
@@ -113,7 +113,7 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def late_progress(label: str) -> Iterator[Callable[[str], None]]:
-    """A counter of steps on stderr of a terminal, for work of more than two seconds; stdout is not used."""
+    """Show a counter of steps on stderr, if it is a terminal and the work takes more than two seconds."""
     start, steps, progress = time.monotonic(), 0, None
 
     def advance(word: str) -> None:
@@ -122,7 +122,7 @@ def late_progress(label: str) -> Iterator[Callable[[str], None]]:
         if _quiet or time.monotonic() - start <= 2.0:
             return
         if progress is None:
-            # Without redirection, since a command's output would go to stderr with the bar.
+            # Without these options, rich would print the command's output to stderr with the bar.
             progress = _progress(transient=True, redirect_stdout=False, redirect_stderr=False)
             progress.add_task(label, total=None, word="")
             progress.tasks[0].start_time = start
@@ -138,14 +138,14 @@ def late_progress(label: str) -> Iterator[Callable[[str], None]]:
 
 
 def print_table(title: str, frame: pd.DataFrame) -> None:
-    """A data frame as a terminal table."""
+    """Print a data frame as a terminal table."""
     numeric = {str(column) for column in frame.columns if frame[column].dtype.kind in "fiu"}
     rows = [list(map(_cell, row)) for row in frame.itertuples(index=False)]
     print_rows(title, [str(column) for column in frame.columns], rows, numeric)
 
 
 def print_records(rows: Sequence[dict[str, str]], right: Iterable[str] = ()) -> None:
-    """The table that is a command's result; with ``--quiet`` its rows alone, with tabs between the cells."""
+    """Print a table that is a command's result; with ``--quiet`` only its rows, separated by tabs."""
     if _quiet:
         for row in rows:
             echo("\t".join(row.values()))
@@ -160,10 +160,11 @@ def print_rows(
     right: Iterable[str] = (),
     solid: Iterable[str] = (),
 ) -> None:
-    """A table on stdout; the columns in ``right`` are aligned to the right.
+    """Print a table on stdout; the columns in ``right`` are aligned to the right.
 
-    A table that is wider than the terminal is continued below, its key columns repeated, so that no word or number
-    is broken, nor a cell in a ``solid`` column. Redirected output is as wide as needed, unless COLUMNS is set.
+    If it is wider than the terminal, it is split into several tables that repeat the key columns, so that no word
+    or number, and no cell of a column in ``solid``, is broken. Redirected output is as wide as needed, unless
+    COLUMNS is set.
     """
     from rich import box
     from rich.cells import cell_len
@@ -204,7 +205,7 @@ def print_rows(
 
 
 def _keys(rows: Sequence[Sequence[str]]) -> int:
-    """The number of first columns that identify every row; 1 if none do."""
+    """Return the smallest number of first columns that identify every row; 1 if there is none."""
     counts = range(1, len(rows[0]) if rows else 1)
     return next((count for count in counts if len({tuple(row[:count]) for row in rows}) == len(rows)), 1)
 
@@ -223,12 +224,13 @@ def _blocks(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
 
 
 def _shared(least: Sequence[int], most: Sequence[int], room: int) -> Sequence[int | None]:
-    """Widths of columns: their longest words, and shares of the remaining room; None if the words do not fit."""
+    """Return the widths of columns: their longest words plus parts of the remaining room; None if words do not
+    fit."""
     spare = room - sum(least)
     if spare < 0:
         return [None] * len(least)
     wanted = [high - low for low, high in zip(least, most, strict=True)]
-    # Short cells come before sentences, which can be wrapped.
+    # The remaining room goes to short cells first, because sentences can be wrapped.
     level = max(
         range(max(wanted, default=0) + 1), key=lambda k: (sum(min(each, k) for each in wanted) <= spare) * k
     )

@@ -30,7 +30,7 @@ _SAME_RATE = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class GyroscopeOptions:
-    """The options of a gyroscope."""
+    """Options of a gyroscope."""
 
     file: Path | None
     fps: float | None
@@ -41,10 +41,10 @@ class GyroscopeOptions:
             raise RsbenchError("--gyro-offset: needs --gyro, a gyroscope's log")
 
     def read(self, source: FrameSource, one_camera: bool) -> Gyroscope | None:
-        """The samples, and the largest error of their clock; None without a log.
+        """Read the samples, and determine the largest error of their clock; None without a log.
 
         Raises:
-            RsbenchError: the log cannot be read or is of another time, or the frame rate is unknown.
+            RsbenchError: the log cannot be read or does not overlap the frames, or the frame rate is unknown.
         """
         if self.file is None:
             return None
@@ -67,7 +67,7 @@ class GyroscopeOptions:
         return Gyroscope(samples=samples, clock_error=FARTHEST_S * fps if unsure else 0.0)
 
     def _fps(self, source: FrameSource, rate: float | None) -> float:
-        """``--fps``, or the rate from the frames' times; RsbenchError if there is none."""
+        """Return ``--fps``, or the rate from the frames' times; RsbenchError if there is none."""
         fps = (rate or said_fps(source.path)) if self.fps is None else self.fps
         if fps is None:
             raise RsbenchError("--fps: is required with --gyro and images, which have no frame rate")
@@ -78,7 +78,7 @@ class GyroscopeOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadoutOptions:
-    """The options of the readout, which replace values of the file of a rig or camera."""
+    """Options of the readout, which replace values in the file of a rig or camera."""
 
     readout_ratio: float | None
     shutter: str | None
@@ -86,14 +86,14 @@ class ReadoutOptions:
 
     @property
     def any(self) -> bool:
-        """Whether the user gave one that concerns only the readout."""
+        """Whether the user gave ``--readout-ratio`` or ``--shutter``."""
         return self.readout_ratio is not None or self.shutter is not None
 
     def beside(self, path: Path | None, gyro: bool, footage: Path | None) -> Readout:
-        """The readout from these options and this file, with the rate of a video if seconds need one.
+        """Return the options for reading the file ``path``, with the rate of a video if times in seconds need one.
 
         Raises:
-            RsbenchError: options that exclude each other, or an unnecessary ``--fps``.
+            RsbenchError: options exclude each other, or ``--fps`` has no effect.
         """
         from rsbench.interop.readers.rig_files import Readout
 
@@ -107,7 +107,7 @@ class ReadoutOptions:
 
 
 def size_of(frames: list[Path] | Path, part: Part = "whole") -> Callable[[], tuple[int, int]]:
-    """A function that returns the (width, height) of the first frame, of a folder or a video."""
+    """Return a function that returns the (width, height) of the first frame of images, a folder or a video."""
 
     def size() -> tuple[int, int]:
         height, width = next(iter(frame_source(frames, part))).shape[:2]
@@ -117,19 +117,19 @@ def size_of(frames: list[Path] | Path, part: Part = "whole") -> Callable[[], tup
 
 
 def frame_source(frames: list[Path] | Path, part: Part = "whole") -> FrameSource:
-    """Images, or a folder or video."""
+    """Return the frames of a list of images, a folder or a video."""
     return FrameSource.of_files(frames) if isinstance(frames, list) else FrameSource(frames, part)
 
 
 def say_notes(option: str, notes: tuple[str, ...]) -> None:
-    """Print the assumptions about a calibration to stderr, a line each."""
+    """Print the assumptions about a calibration to stderr, one line each."""
     for note in notes:
         echo(f"rsbench: note: {option}: {note}", err=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arranged:
-    """The files of a command line, of one camera or of a rig."""
+    """The input files of a command line, of one camera or of a rig."""
 
     one_camera: bool
     frames: list[Path] | None
@@ -142,7 +142,7 @@ class Arranged:
 
 
 def is_rendered(folder: Path) -> bool:
-    """Whether a folder is a dataset or one of its sequences."""
+    """Return whether a folder is a dataset or one of its sequences."""
     return any((folder / name).is_file() for name in ("dataset.json", "sequence.json"))
 
 
@@ -155,10 +155,10 @@ def arranged(
     right: Path | None,
     side_by_side: bool,
 ) -> Arranged:
-    """Sort the given files: frames of one camera, unless there is a rig.
+    """Determine what the given files are; without a rig, they are frames of one camera.
 
     Raises:
-        RsbenchError: files that do not exist or do not go together.
+        RsbenchError: files do not exist or do not belong together.
     """
     files = frames or []
     for path in files:
@@ -228,7 +228,7 @@ def _is_image(path: Path) -> bool:
 
 
 def _nearest(path: Path) -> str:
-    """Similar names in the folder of a path, for a message."""
+    """Return similar names in the folder of a path, for a message."""
     folder = path.parent
     names = sorted(each.name for each in folder.iterdir()) if folder.is_dir() else []
     near = difflib.get_close_matches(path.name, names, 3)
@@ -236,15 +236,16 @@ def _nearest(path: Path) -> str:
 
 
 def default_out(path: Path) -> Path:
-    """The default place of the results: a video in the current folder, or a folder."""
+    """Return the default output: a video in the current folder for a file, otherwise a folder."""
     return Path(f"{path.stem}-corrected.mp4" if path.is_file() else f"{path.resolve().name}-corrected")
 
 
 def check_out(out: Path) -> None:
-    """Refuse an impossible place for results before work begins.
+    """Check before the work begins that the results can be written to ``out``.
 
     Raises:
-        RsbenchError: the name ends like an image or an unsupported video, or a file is in place of a folder.
+        RsbenchError: the name is that of an image or an unsupported video, a file is in place of a folder, or the
+            folder is not writable.
     """
     video = written_as_video(out)
     if _is_image(out):
@@ -258,19 +259,19 @@ def check_out(out: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectInput:
-    """The frames to correct, and the place of the results."""
+    """The frames to correct, their calibration, and the place of the results."""
 
     card: RigCard | OneCameraCard
     out: Path
     four: list[Path] = field(default_factory=list)
-    """Left 0, right 0, left 1, right 1; empty for footage."""
+    """Images left 0, right 0, left 1, right 1; empty for a sequence."""
     footage: list[list[Path] | Path] = field(default_factory=list)
-    """Images, or the folder or video, of the left and the right camera, or of one."""
+    """Images, folder or video of the left and the right camera, or of the only camera."""
     words: str = ""
     """The assumption about the files; empty if there is none."""
     gyro: GyroscopeOptions
     side_by_side: bool = False
-    """Whether both cameras are halves of the frames of one video or folder."""
+    """Whether each frame of one video or folder has the images of both cameras side by side."""
     row_poses: bool = False
     """Whether to write the pose at every row of a sequence."""
     rectify: bool = False
@@ -288,13 +289,13 @@ class CorrectInput:
 
     @property
     def page(self) -> Path:
-        """Path of the page."""
+        """Path of the HTML report."""
         from rsbench.dataset.corrected_frames import page_of_video
 
         return page_of_video(self.out) if self.video else self.out / "report.html"
 
     def sources(self) -> list[FrameSource]:
-        """The frames of each camera."""
+        """Return the frames of each camera."""
         parts: tuple[Part, ...] = SIDES if self.side_by_side else ("whole",) * len(self.footage)
         return [frame_source(each, part) for each, part in zip(self.footage, parts, strict=True)]
 
@@ -307,7 +308,7 @@ def given_camera(
     gyro: GyroscopeOptions,
     readout: ReadoutOptions,
 ) -> CorrectInput:
-    """The frames of one camera; RsbenchError for options that do not go together."""
+    """Return the input of one camera; RsbenchError for options that exclude each other."""
     from rsbench.interop.readers.rig_files import read_camera_file
 
     files: list[Path] | Path = given.frames if given.frames is not None else given.left or Path()
@@ -350,7 +351,7 @@ def given_frames(
     row_poses: bool,
     side_by_side: bool,
 ) -> CorrectInput:
-    """The frames of a rig; RsbenchError for options that do not go together."""
+    """Return the input of a rig; RsbenchError for options that exclude each other or are missing."""
     frames, left, right = given.frames, given.left, given.right
     if frames is not None and len(frames) == 1 and is_rendered(frames[0]):
         if rig or left or right or readout.any:
@@ -381,7 +382,7 @@ def given_frames(
 
 
 def _of_sequence(folder: Path, out: Path, gyro: GyroscopeOptions, row_poses: bool) -> CorrectInput:
-    """The rolling-shutter frames of a sequence of a dataset."""
+    """Return the input for the rolling-shutter frames of a sequence of a dataset."""
     from rsbench.dataset.sequence import read_dataset_manifest, read_sequence
 
     if not (folder / "sequence.json").is_file():
@@ -397,7 +398,7 @@ def _of_sequence(folder: Path, out: Path, gyro: GyroscopeOptions, row_poses: boo
 
 
 def sequence_files(sequence: Sequence) -> list[list[Path] | Path]:
-    """The rolling-shutter frames of the left and the right camera of a rendered sequence."""
+    """Return the rolling-shutter frames of the left and the right camera of a rendered sequence."""
     from rsbench.dataset.layout import picture_file
 
     frames = range(sequence.frames)
@@ -405,7 +406,7 @@ def sequence_files(sequence: Sequence) -> list[list[Path] | Path]:
 
 
 def target_row(target: str, height: int) -> float:
-    """The row that ``--target`` names; RsbenchError if there is none."""
+    """Return the row that ``--target`` names; RsbenchError if there is no such row."""
     named = {"first": 0.0, "middle": (height - 1) / 2, "last": height - 1.0}
     if target in named:
         return named[target]

@@ -53,7 +53,7 @@ SUBTITLE = "Rolling shutter to global shutter"
 
 
 def motion_facts(motion: dict[str, Any] | None) -> list[tuple[str, str]]:
-    """Facts about the motion for the page of four frames."""
+    """Return names and values that describe the motion, for the report on four frames."""
     if motion is None:
         return []
     names = "rotation in a frame period", "translation in a frame period"
@@ -68,7 +68,7 @@ def motion_facts(motion: dict[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def camera_facts(record: dict[str, Any]) -> dict[str, str]:
-    """Focal length and clock of the gyroscope, from the record of one camera."""
+    """Return text on the focal length and the gyroscope's clock, from the record of one camera."""
     focal, sigma = f"{record['camera']['fx']:.1f}", record["focal_length_sigma"]
     how = "found"
     if record["focal_length_assumed"]:
@@ -112,14 +112,14 @@ def say_calibration(record: dict[str, Any]) -> None:
 
 
 def listed(frames: Iterable[tuple[int, str]]) -> str:
-    """Numbers of frames and why; of many the first ones."""
+    """Return text with frame numbers and reasons, at most ``_MOST_LISTED`` of them."""
     words = [f"frame {number} ({why})" for number, why in frames]
     more = [f"and {len(words) - _MOST_LISTED} more, see motion.json"] if len(words) > _MOST_LISTED else []
     return "; ".join(words[:_MOST_LISTED] + more)
 
 
 def alone_of(frames: Mapping[Any, Fused]) -> dict[str, Any]:
-    """For motion.json: how frames were corrected that the motion of the rig does not explain; empty if it does."""
+    """Return, for motion.json, how frames that the rig's motion does not explain were corrected; empty if none."""
     names = {view: view if isinstance(view, str) else "{}_{}".format(*view) for view in frames}
     notes = {names[view]: each.note for view, each in frames.items() if each.note}
     return notes and {"explained": min(each.explained for each in frames.values()), **notes}
@@ -141,11 +141,11 @@ def _say_alone(alone: Mapping[Any, Mapping[str, Any]]) -> None:
 
 
 _PAGE_FRAMES, _AHEAD = 6, 4
-"""Number of frames on the page; number of frames that are read ahead while others are encoded."""
+"""Number of frames in the report; number of frames that are read ahead while others are encoded."""
 
 
 def correct_given(given: CorrectInput, target: str, options: CorrectionOptions, close: bool) -> None:
-    """Correct four frames or a sequence; exit 1 if it fails. ``close``: close narrow holes of corrected frames."""
+    """Correct four frames or a sequence; exit code 1 if it fails. ``close``: whether to close narrow holes."""
     try:
         with nullcontext() if given.one_camera else compiling_ahead(), Isolation() as isolation:
             options = isolation.chain(options)
@@ -159,7 +159,7 @@ def correct_given(given: CorrectInput, target: str, options: CorrectionOptions, 
 
 
 def without_filling(entry: CorrectorEntry) -> CorrectorEntry:
-    """The built-in corrector without filling from other views; RsbenchError for other correctors."""
+    """Return the built-in corrector without filling from other views; RsbenchError for other correctors."""
     if not isinstance(entry.component, FusionCorrector):
         raise RsbenchError(f"--no-fill: has no effect on corrector {entry.name!r}; leave it out")
     component = replace(entry.component, use_other_views=False)

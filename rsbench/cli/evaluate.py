@@ -156,7 +156,7 @@ def _correction_scores(recordings: Sequence[Recording], corrector: str) -> pd.Da
 
 
 def _means(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean scores of the pairs, by target row and method."""
+    """Return mean scores over the pairs, by target row and method."""
     groups = table.groupby(["row", "method"], sort=False)
     means = groups[["psnr", "ssim", "psnr_mask", "ssim_deepunroll"]].mean().dropna(axis="columns")
     means.insert(0, "frames", groups.size())
@@ -170,11 +170,11 @@ _ON_REQUEST = (
     *("gs-p3p", "gs-stereo-triplets", "gs-stereo-triplets-lines", "rs-r6p", "rs-r6p-single"),
     *("gs-upright-3pt", "gs-upright-4pt", "rs-gyro-5pt", "rs-gyro-stereo"),  # need a sensor
 )
-"""Solvers that run only if they are named, as they would double the time; boards on images have most of them."""
+"""Solvers that run only if they are named, because they would double the time; most are on boards of frames."""
 
 
 def every_solver() -> list[str]:
-    """Names of shipped and installed solvers, each solver once, without those that run only by request."""
+    """Return the names of shipped and installed solvers, each once, without those that run only if named."""
     from rsbench.solvers.engine.base import list_solvers
 
     return [name for name in list_solvers() if name not in _ON_REQUEST]

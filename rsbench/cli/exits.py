@@ -1,11 +1,11 @@
-"""Early ends of a command: by Ctrl-C or SIGTERM, or by an unexpected error.
+"""Termination of a command by Ctrl-C or SIGTERM, or by an unexpected error.
 
-A signal ends every command within two seconds, with a line that says how to go on and exit code 130 or 143. It
-raises ``Stopped`` in the main thread, so that everything is closed in order. The main thread may be deep in a
-computation that does not come back to Python for seconds: then a thread that is woken by the same signal ends the
-process. Child processes end with it, whatever they do (``rsbench.jobs.isolation``). SIGHUP is left to the system.
+A signal ends every command within two seconds, with a line on how to continue and exit code 130 or 143. It raises
+``Stopped`` in the main thread, so that everything is closed in order. If the main thread is in a computation that
+does not return to Python for seconds, a thread that is woken by the same signal ends the process. Child processes
+end with it in any case (``rsbench.jobs.isolation``). SIGHUP is left to the system.
 
-An unexpected error becomes one line for the user, and its traceback goes to a log.
+For an unexpected error, the user gets one line, and the traceback is written to a log.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ _ADVICE = {
     "export": "--out is as it was before",
     "solve": "nothing is kept; what was answered stays answered",
 }
-"""What the user can do after an interruption, by command."""
+"""Text on what the user can do after an interruption, by command."""
 _SHOW_CURSOR = "\x1b[?25h"
 
 
 class Stopped(BaseException):
-    """A signal to end arrived; not ``KeyboardInterrupt``, for which typer prints its own message."""
+    """A signal to end was received; it is no ``KeyboardInterrupt``, for which typer prints its own message."""
 
 
 def end_at_once(number: int, frame: FrameType | None = None) -> NoReturn:
-    """Signal handler while nothing has to be closed yet."""
+    """End the process on a signal, without closing anything; the handler before a command begins."""
     with contextlib.suppress(OSError):
         os.write(2, f"{_ending()}\n".encode())
     os._exit(128 + number)
@@ -59,7 +59,7 @@ def end_at_once(number: int, frame: FrameType | None = None) -> NoReturn:
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Context of a whole command, in the main thread."""
+    """Run a whole command as the body, in the main thread; a signal ends it in order."""
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     # A signal that is ignored from the start, as in the background of a shell without job control, stays ignored.
     ours = [number for number, handler in before.items() if handler != signal.SIG_IGN]
@@ -77,7 +77,7 @@ def stoppable() -> Iterator[None]:
                 signal.signal(number, stop)
             yield
         except BaseException:
-            # Interrupted code may raise another error instead, as the import of a module does.
+            # Interrupted code may raise another error than ``Stopped``, as the import of a module does.
             if not received:
                 raise
             _print_ending()
@@ -98,7 +98,7 @@ def _watched() -> Iterator[None]:
     done = threading.Event()
     threading.Thread(target=_watch, args=(reader, done), daemon=True).start()
     wakeup = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    # Where ``Stopped`` cannot be passed on, as in a destructor, the thread ends the process.
+    # If ``Stopped`` cannot propagate, as in a destructor, the thread ends the process.
     sys.unraisablehook = lambda problem: None if problem.exc_type is Stopped else hook(problem)
     try:
         yield
@@ -138,7 +138,7 @@ _KEPT = 20
 
 
 def describe(error: Exception) -> str:
-    """One line about an unexpected error, with the path of its log."""
+    """Write the log of an unexpected error, and return one line about the error with the path of the log."""
     words = " ".join(traceback.format_exception_only(error)[-1].split())
     log = _write_log("".join(traceback.format_exception(error)))
     where = f"what led to it: {log}" if log is not None else "no log of it could be written"

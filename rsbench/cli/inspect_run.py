@@ -31,30 +31,30 @@ from rsbench.vision.feature_matcher import load_features
 
 @dataclass(frozen=True, kw_only=True)
 class InspectOptions:
-    """What holds for all rigs."""
+    """Options that apply to all rigs."""
 
     models: tuple[str, ...]
     windows: int
     features: str
     seed: int
     readout: ReadoutOptions
-    """The readout given by options, to be printed beside the estimate; it replaces that of the calibration."""
+    """Options of the readout, which replace that of the calibration; it is printed beside the estimate."""
     max_sigma: float
 
     @property
     def chain(self) -> CorrectionOptions:
-        """How frames are matched."""
+        """Options with which frames are matched."""
         return CorrectionOptions(features=load_features(self.features), seed=self.seed)
 
 
 Found = Iterator[dict[str, Any] | RsbenchError]
-"""For each rig the answer, or the error if its input is wrong."""
+"""The answer for each rig, or the error if its input is invalid."""
 
 
 def inspections(
     given: list[Path], rig: Path | None, left: Path | None, right: Path | None, options: InspectOptions
 ) -> Found:
-    """Raises RsbenchError for another combination of arguments."""
+    """Inspect the rigs of problems, frames or datasets; RsbenchError for an invalid combination of arguments."""
     for model in options.models:
         load_kernel(model)
     if rig is not None and not given and left is not None and right is not None:
@@ -114,7 +114,7 @@ def _of_windows(
     options: InspectOptions,
 ) -> dict[str, Any]:
     """Inspect a rig by windows of two successive frames, evenly spaced in the sequence."""
-    unknown = Scanning(scan="left")  # as for columns: matches may be on any rows
+    unknown = Scanning(scan="left")  # as if columns were read, so that matches may be on any rows
     every, windows = max((left.count - 1) // options.windows, 1), list[Window]()
     with Isolation() as isolation:
         chain = isolation.chain(options.chain)
@@ -162,7 +162,7 @@ def _record(name: str, found: Capture, given: RollingShutter | None) -> dict[str
 
 
 def row_of(answer: dict[str, Any]) -> dict[str, str]:
-    """Cells of the table."""
+    """Return the table cells of an answer, by column."""
     given, determined = answer["said"], answer["told"]
     late = determined and abs(answer["right_delay"]) > max(3.0 * answer["right_delay_sigma"], 0.01)
     note = f"right camera late by {answer['right_delay']:+.3f} frame periods" if late else answer["reason"]

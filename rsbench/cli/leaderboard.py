@@ -269,7 +269,7 @@ def run(
 
 
 def _stored(whole: Split, split: Split, folder: Path | None) -> list[Scored]:
-    """Score stored predictions, of ``folder`` or else those installed with rsbench, on a part of a split."""
+    """Score stored predictions, those in ``folder`` or those installed with rsbench, on a part of a split."""
     from rsbench.benchmark.leaderboard.board import restore
     from rsbench.components.cards import shipped_folder
 
@@ -541,7 +541,7 @@ def _echo_doubt(scored: Scored) -> None:
 
 
 def _scoring(split: Split) -> AbstractContextManager[Callable[[str], None]]:
-    """Progress bar of the problems whose pictures are scored; none for tracks without pictures."""
+    """Return a progress bar for scoring the pictures of problems; no bar for tracks without pictures."""
     if not split.track.pictures:  # other scores take no time
         return nullcontext(lambda word: None)
     return progress_bar(f"scoring {split.name}", len(split.truths))

@@ -31,22 +31,22 @@ COMPONENTS = {
     "correctors": "rsbench.vision.corrector:CORRECTORS",
     "metrics": "rsbench.benchmark.scoring:METRICS",
 }
-"""Kinds whose names may come from installed packages, and the location of their ``plugins.Kind``."""
+"""Kinds with names from installed packages too, and the location of their ``plugins.Kind``."""
 
 
 _GROUPS = {"builders": "rsbench.scenes"}
-"""Groups of entry points whose name differs from that of the kind."""
+"""Groups of entry points, for kinds whose group is not ``rsbench.KIND``."""
 
 
 def kind_names() -> list[str]:
-    """All kinds, sorted: the folders of cards, and components that have none."""
+    """Return all kinds, sorted: kinds of cards, and kinds of components without cards."""
     from rsbench.components.cards import CardKind
 
     return sorted({*get_args(CardKind), *COMPONENTS})
 
 
 def component_kind(kind: str) -> Any:
-    """The ``plugins.Kind`` of a kind; None for kinds whose cards name no class."""
+    """Return the ``plugins.Kind`` of a kind; None for kinds whose cards name no class."""
     if kind not in COMPONENTS:
         return None
 
@@ -55,7 +55,7 @@ def component_kind(kind: str) -> Any:
 
 
 def names_of(kind: str) -> list[str]:
-    """Names of one kind, sorted."""
+    """Return the names of one kind, sorted."""
     from rsbench.components import plugins
     from rsbench.components.cards import list_cards
 
@@ -64,7 +64,7 @@ def names_of(kind: str) -> list[str]:
 
 
 def complete(kind: str = "") -> Callable[[str], list[str]]:
-    """Shell completion of the names of one kind, or of all, from cards and entry points only, to be quick."""
+    """Return a shell completion for names of one kind, or of all; to be fast, it imports no components."""
 
     def names(incomplete: str) -> list[str]:
         found = {name for each in ([kind] if kind else kind_names()) for name in _quick_names(each)}
@@ -74,22 +74,22 @@ def complete(kind: str = "") -> Callable[[str], list[str]]:
 
 
 def named(kind: str, text: str, *names: str) -> Any:
-    """An option that takes a name of one kind or a path; ``text`` is its help, ``names`` those of the option."""
+    """Return an option for a name of one kind or a path; ``text`` is its help, ``names`` are its own names."""
     return typer.Option(*names, help=text, autocompletion=complete(kind))
 
 
 def complete_kind(incomplete: str) -> list[str]:
-    """Shell completion of a kind."""
+    """Return the kinds that begin with ``incomplete``, for shell completion."""
     return [name for name in kind_names() if name.startswith(incomplete)]
 
 
 def _quick_names(kind: str) -> set[str]:
-    """Names of one kind without imports; classes of rsbench without a card are left out."""
+    """Return names of one kind without importing components; rsbench's classes without a card are left out."""
     from rsbench.components.cards import CardKind, list_cards
 
     names = set(list_cards(kind)) if kind in get_args(CardKind) else set()  # pyrefly: ignore[bad-argument-type]
     if kind in COMPONENTS:
-        # Metadata of a package may be unreadable: ``rsbench list`` reports it.
+        # Unreadable metadata of a package are reported by ``rsbench list``.
         with contextlib.suppress(Exception):
             group = _GROUPS.get(kind, f"rsbench.{kind}")
             names |= {point.name for point in metadata.entry_points(group=group)}
@@ -134,9 +134,9 @@ def list_(
 
 
 def entries(kind: str) -> list[dict[str, Any]]:
-    """Name, origin, description, card and error of all names of one kind.
+    """Return name, origin, description, card and error for all names of one kind.
 
-    Components of installed packages are loaded to see whether they work; an error concerns only that entry.
+    Components of installed packages are loaded to test whether they work; an error affects only its own entry.
     """
     from rsbench.components import plugins
     from rsbench.components.cards import list_cards
@@ -307,15 +307,14 @@ def _about_class(kind: Kind[Any, Any], name: str) -> dict[str, Any]:
 
 
 def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
-    """The parameters of a component's class, in the order of its constructor.
+    """Return the parameters of a component's class, in the order of its constructor.
 
     Args:
         cls: a dataclass, whose fields have docstrings below them, or any class.
-        component: an object of it, for the values.
+        component: an instance of it, for the values.
 
     Returns:
-        ``parameter``, ``type``, ``default``, ``value`` (as in a card; "" where there is none) and ``meaning`` of
-        each.
+        ``parameter``, ``type``, ``default``, ``value`` (as in a card, or "") and ``meaning`` of each parameter.
     """
     meanings = field_docstrings(cls)
     required = inspect.Parameter.empty
@@ -341,7 +340,7 @@ def parameters_of(cls: type, component: object = None) -> list[dict[str, Any]]:
 
 
 def value_in_a_card(value: object) -> Any:
-    """A value as in a card; empty text for None, which a card cannot hold."""
+    """Convert a value to its form in a card; None, which a card cannot contain, becomes empty text."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: value_in_a_card(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, (list, tuple)):
@@ -352,13 +351,13 @@ def value_in_a_card(value: object) -> Any:
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
-    """Docstrings below the fields of a class and its base classes, in one line each."""
+    """Return the docstrings below the fields of a class and its base classes, each in one line, by field."""
     return {name: text for parent in reversed(cls.__mro__[:-1]) for name, text in _own_docstrings(parent)}
 
 
 @functools.cache
 def _own_docstrings(cls: type) -> tuple[tuple[str, str], ...]:
-    """Names and docstrings of a class's own fields; cached, as finding the source takes up to 0.1 s."""
+    """Return names and docstrings of a class's own fields; cached, since finding the source takes up to 0.1 s."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):  # defined in a shell, or without source

@@ -51,7 +51,7 @@ EPILOG = """[bold]Examples[/bold]
 
 
 class _Recipe(NamedTuple):
-    """How a target is made."""
+    """The function that makes a target, with its inputs and outputs."""
 
     maker: str
     """``module:function`` below ``rsbench.cli``; its parameters are any of ``out``, ``data``, ``workers``,
@@ -59,20 +59,20 @@ class _Recipe(NamedTuple):
     minutes: int
     """Time on two cores, measured in November 2026, for estimates of the remaining time."""
     rendered: tuple[str, ...] = ()
-    """Folders of datasets below ``--data`` that it reads; missing ones are rendered first."""
+    """Folders of datasets below ``--data`` that it reads; missing datasets are rendered first."""
     folders: tuple[str, ...] = ()
-    """Folders below ``--out`` that it writes to, by default that of its name; they are created before the call."""
+    """Folders below ``--out`` that it writes to; by default the one of its name. They are created first."""
     seeds: int = 1
     """Number of runs of each solver in the committed results."""
 
 
 class Target(StrEnum):
-    """What can be reproduced, and how."""
+    """A target of the command, with its recipe."""
 
     recipe: _Recipe
 
     def __new__(cls, name: str, recipe: _Recipe | None = None) -> Self:
-        """A name with its recipe."""
+        """Create a target from its name and recipe."""
         made = str.__new__(cls, name)
         made._value_ = name
         made.recipe = recipe or _Recipe("", 0)
@@ -110,7 +110,7 @@ _ORDER = (
 """Targets of ``everything``: ``claims`` includes fig3, ``fig4`` includes fig4-literal; image claims come last, as
 they judge the results of the others."""
 _KEPT = 0.1
-"""Share of its expected time below which a target is assumed to have existed already."""
+"""If a target takes less than this share of its expected time, its data are assumed to have existed before."""
 
 
 def reproduce(
@@ -183,7 +183,7 @@ def _make(
 
 
 def _left(targets: Sequence[Target], paces: Sequence[float]) -> str:
-    """Text: estimated time of the next target and of all remaining ones, from the time that previous ones took."""
+    """Return text with the estimated time of the next target and of all remaining ones, from previous targets."""
     made = [pace for pace in paces if pace > _KEPT]
     minutes = [each.recipe.minutes * (statistics.median(made) if made else 1.0) for each in targets]
     begin = _about(minutes[0])
@@ -195,7 +195,7 @@ def _about(minutes: float) -> str:
 
 
 def _first(target: Target, data: Path) -> str:
-    """Text: what is rendered or required before a target is made; empty if nothing."""
+    """Return text on what is rendered or required before a target is made; empty if nothing is."""
     if target is Target.image_claims:
         return "; judges what the other targets have written: make them first"
     places = [data / name for name in target.recipe.rendered]
@@ -215,7 +215,7 @@ def _reproduce(target: Target, out: Path, data: Path, workers: int | None, seeds
 
 
 def images(out: Path, data: Path, seeds: int) -> None:
-    """The paper's image experiment, by every solver."""
+    """Reproduce the paper's image experiment with every solver."""
     from rsbench.benchmark.images.plan import EvaluationOptions
     from rsbench.cli.evaluate import evaluate_dataset, every_solver
     from rsbench.cli.generate import generate

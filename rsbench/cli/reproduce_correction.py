@@ -43,22 +43,22 @@ from rsbench.scenes.load import load_scene
 from rsbench.storage.files import read_png, write_json, write_png, write_table
 
 LAWS_FRAMES = "laws-frames"
-"""Folder of the card ``laws``."""
+"""Folder of the dataset of the card ``laws``."""
 STRATA = ("mild", "moderate", "aggressive", "poles")
 SCENES = ("castle", "old-town", "room")
 _FIG4 = (("paper", ""), ("moderate", "-2"), ("aggressive", "-2"))
-"""Cards of the figure, and the endings that are added to a scene's name for the names of their sequences."""
+"""Cards of the figure, and suffixes that make the names of their sequences from those of scenes."""
 _LITERAL_SCENE, _LITERAL_SEEDS = "castle", 10
 """Sequence of the paper's card, and number of RANSAC seeds that are scored; the result of the first is drawn."""
 _SHOWN = "castle-aggressive-2"
-"""Sequence in the picture of real cameras."""
+"""Sequence in the picture of ``real``."""
 _SGM = (("mild", "castle-2"), ("moderate", "castle-2"), ("mild", "room-3"), ("moderate", "room-3"))
 
 
 def fig4(out: Path, data: Path) -> None:
-    """The six panels of the paper's Figure 4 in every scene, for its motion and two larger ones, by ours.
+    """Reproduce the paper's Figure 4 in every scene with rsbench's methods, for its motion and two larger ones.
 
-    That by the paper's own components comes first, see ``fig4_literal``.
+    Run ``fig4_literal`` first, which has the paper's own components.
     """
     folder = out / "fig4"
     fig4_literal(out, data)
@@ -79,7 +79,7 @@ def fig4(out: Path, data: Path) -> None:
 
 
 def fig4_literal(out: Path, data: Path) -> None:
-    """The paper's Figure 4 in its scene, by the paper's own solver, matches and correction of a single view."""
+    """Reproduce the paper's Figure 4 in its scene with the paper's solver, matches and single-view correction."""
     folder = out / "fig4"
     _generate("paper", data)
     sequence = read_sequence(data / "paper" / _LITERAL_SCENE)
@@ -96,7 +96,10 @@ def fig4_literal(out: Path, data: Path) -> None:
 
 
 def correction(out: Path, data: Path, workers: int | None = None) -> None:
-    """Baselines, ours and oracles on the strata; ``workers`` processes, one per core for None."""
+    """Score baselines, rsbench's methods and oracles on the cards of ``STRATA``.
+
+    ``workers``: number of processes; None: one per core.
+    """
     folder = out / "correction"
     studies = [_studied(card, card, data, workers) for card in STRATA]
     images, bands, motions = (pd.concat(table, ignore_index=True) for table in zip(*studies, strict=True))
@@ -113,7 +116,7 @@ def correction(out: Path, data: Path, workers: int | None = None) -> None:
 
 
 def laws_correction(out: Path, data: Path, workers: int | None = None) -> None:
-    """The same methods under five motion models, on the sequences of ``laws`` without sensor noise."""
+    """Score the same methods under five motion models, on the sequences of ``laws`` with an ideal sensor."""
     folder = out / "laws-correction"
     images, _, motions = _studied("laws", LAWS_FRAMES, data, workers, lambda name: "-ideal-" in name)
     write_table(folder / "sequences.csv", by_sequence(images))
@@ -142,7 +145,7 @@ def _studied(
 
 
 def sgm(out: Path, data: Path) -> None:
-    """Semi-global matching when the right camera reads its rows at other times."""
+    """Score semi-global matching if the right camera reads its rows at other times than the left one."""
     folder = out / "sgm"
     cards = list(dict.fromkeys(card for card, _ in _SGM))
     for card in cards:
@@ -167,7 +170,7 @@ def sgm(out: Path, data: Path) -> None:
 
 
 def real(out: Path, data: Path, seeds: int, width: int | None) -> None:
-    """The default pipeline on rendered frames with lens, blur and noise, beside an ideal camera's."""
+    """Score the default pipeline on rendered frames with lens, blur and noise, and on those of an ideal camera."""
     if seeds < real_cameras.FEWEST_SEEDS:
         raise RsbenchError(f"--seeds {seeds}: must be at least {real_cameras.FEWEST_SEEDS}")
     folder, card = out / "real", load_dataset_card("real")
@@ -209,13 +212,13 @@ def _draw_real(places: dict[str, Path], folder: Path) -> Path:
 
 
 def _write_provenance(folder: Path, target: str, datasets: Iterable[Path], name: str = "provenance.json") -> None:
-    """Record the command, the code and the datasets from which a target was made."""
+    """Write the command, the code and the datasets from which a target was made."""
     records = [dataset_record(dataset) for dataset in datasets]
     write_json(folder / name, provenance(f"rsbench reproduce {target}", datasets=records))
 
 
 def _generate(card: str, data: Path, name: str = "") -> None:
-    """Render the missing sequences of a card; always all of them, so that every target gets the same dataset."""
+    """Render all missing sequences of a card, even unused ones, so that every target has the same dataset."""
     generate(card, str(data / (name or card)), None, workers=1)
 
 

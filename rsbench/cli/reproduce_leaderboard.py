@@ -1,5 +1,5 @@
-"""``rsbench reproduce leaderboard``, ``laws``, ``boards``, ``handheld``, ``footage``, ``recorded``, ``held-out``:
-the boards with the entries of rsbench."""
+"""Targets of ``rsbench reproduce`` that make boards with rsbench's entries: leaderboard, laws, boards, handheld,
+footage, recorded, held-out."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ BOARD, LAWS, HANDHELD, FOOTAGE, RECORDED = "leaderboard", "laws", "handheld", "f
 HELD_OUT = "held-out"
 """Names of folders of boards and their results."""
 OWN_RECORDINGS = "euroc"
-"""Folder below ``--data`` of recordings that do not come with rsbench."""
+"""Folder below ``--data`` with recordings of the user, which do not come with rsbench."""
 SAME_METHOD = {
     "rs-r6p-single": "rs-r6p",
     "rs-stereo-iterated": "rs-stereo-iterated-metric",
@@ -46,7 +46,7 @@ SAME_METHOD = {
     "rs-stereo-tracks": "rs-stereo-refined",
 }
 """Cards that are left out, each with the entry that represents its method: similar versions would reduce the power
-of all comparisons, which are corrected for the number of pairs."""
+of all comparisons, because these are corrected for the number of pairs."""
 COMPARED = (
     *("rs-stereo-auto", "rs-stereo-refined", "rs-stereo-refined-twist", "gs-stereo-tracks-scaled", "gs-poselib"),
     *("gs-poselib-scaled", "gs-8pt", "gs-5pt-opencv", "rs-mono-refined", "gs-poselib-stereo", "rs-r6p"),
@@ -54,15 +54,15 @@ COMPARED = (
 )
 """Entries of rsbench that are run on held-out splits."""
 _PUBLISHED = {"points-1": BOARD, "points-2": LAWS}
-"""Folders of results with the published predictions of rsbench's entries on the public splits."""
+"""Folder of results with the published predictions of rsbench's entries on the public split, by protocol."""
 _OF_ONE_CAMERA = ("mono-fusion", "flow-scaled", "rotation-only", "zhuang", "vasu-layers", "gyro", "fusion")
 """Correctors of one camera, and the rig's corrector, to show the benefit of a second camera."""
 
 
 def leaderboard(out: Path, data: Path, workers: int | None) -> None:
-    """The board of simulated points, which may have other entries too, and the scores of the smoke run.
+    """Make the board of simulated points, which may already have other entries, and the scores of the smoke run.
 
-    The answers are published too: ``leaderboard run points`` ranks beside them.
+    The predictions are published too; ``rsbench leaderboard run points`` ranks users' methods beside them.
     """
     board, folder = data / BOARD, out / BOARD
     _fill(board, {"points": own_solvers()}, workers)
@@ -74,9 +74,9 @@ def leaderboard(out: Path, data: Path, workers: int | None) -> None:
 
 
 def laws(out: Path, data: Path, workers: int | None) -> None:
-    """Points and frames under several motion models, and what entries answered.
+    """Make the board of points and frames under several motion models, and store the predictions.
 
-    Of pictures the site alone is published: the answers are gigabytes.
+    On tracks of pictures, the predictions are not stored, because they take gigabytes.
     """
     board, folder = data / LAWS, out / LAWS
     _fill(board, entries_of_laws(), workers, "laws", data / LAWS_FRAMES)
@@ -87,20 +87,20 @@ def laws(out: Path, data: Path, workers: int | None) -> None:
 
 
 def boards(out: Path, data: Path, workers: int | None) -> None:
-    """The tracks of frames on the dev split of ``standard``."""
+    """Add the tracks of frames, on the dataset ``standard``, to the board."""
     _fill(data / BOARD, entries_of_frames(), workers, "standard", data / "standard")
     publish(data / BOARD, out / "leaderboard")
 
 
 def handheld(out: Path, data: Path, workers: int | None) -> None:
-    """The track of trajectories on footage from hands."""
+    """Make the board of trajectories, on hand-held sequences."""
     board = data / f"{HANDHELD}-board"
     _fill(board, {"trajectory": list(METHODS)}, workers, "handheld", data / HANDHELD, oracles_too=False)
     publish(board, out / HANDHELD, "rsbench reproduce handheld")
 
 
 def footage(out: Path, data: Path, workers: int | None) -> None:
-    """The track of one camera, on frames of ``footage``, and of ``standard``, which has no gyroscope."""
+    """Make the board of correctors of one camera, on the datasets ``footage`` and ``standard`` (no gyroscope)."""
     board, without_gyro = data / f"{FOOTAGE}-board", [each for each in _OF_ONE_CAMERA if each != "gyro"]
     for name, entries in ((FOOTAGE, list(_OF_ONE_CAMERA)), ("standard", without_gyro)):
         _fill(board, {"correction-mono": entries}, workers, name, data / name)
@@ -108,7 +108,7 @@ def footage(out: Path, data: Path, workers: int | None) -> None:
 
 
 def recorded(out: Path, data: Path, workers: int | None) -> None:
-    """The track of points on recordings: on those that come with rsbench, and on the user's own copy of others."""
+    """Make the board of points on recordings, both those that come with rsbench and the user's own."""
     board, folder, own = data / f"{RECORDED}-board", out / RECORDED, data / OWN_RECORDINGS
     if not own.is_dir():
         echo(
@@ -130,12 +130,12 @@ def recorded(out: Path, data: Path, workers: int | None) -> None:
 
 
 def held_out(out: Path, data: Path, workers: int | None) -> None:
-    """The announced secret splits of the tracks of points beside the public ones, with solvers of others.
+    """Run solvers, also of other authors, on the announced secret splits and the public splits of points.
 
-    Of public splits, the published answers of ours count as run; an entry that the board has is not run again.
+    On public splits, published predictions of rsbench's entries are used. Entries on the board are not run again.
 
     Raises:
-        RsbenchError: the text or a split is not the announced one.
+        RsbenchError: the secret text or a split is not the announced one.
     """
     folder, board, count = out / HELD_OUT, data / f"{HELD_OUT}-board", workers or os.cpu_count() or 1
     seed_file, about, tables = folder / "seed.txt", read_json(folder / "announced.json"), list[pd.DataFrame]()
@@ -166,7 +166,7 @@ def held_out(out: Path, data: Path, workers: int | None) -> None:
 
 
 def solvers_of_others() -> list[str]:
-    """The solvers in examples/solvers whose packages are installed, as ``FILE.py:NAME``."""
+    """Return the solvers in examples/solvers whose packages are installed, as ``FILE.py:NAME``."""
     found = list[str]()
     for file in sorted(shipped_folder("examples/solvers", "_docs/examples/solvers").glob("*.py")):
         names = [f"{file}:{file.stem}{ending}" for ending in ("", "_scaled")]
@@ -178,7 +178,7 @@ def solvers_of_others() -> list[str]:
 
 
 def _check_announced(split: Split, seed_file: Path, commitment: str, fingerprint: str) -> None:
-    """Raise RsbenchError if a secret split or its seed text is not the announced one."""
+    """Raise RsbenchError if a secret split or its text is not the announced one."""
     if read_secret(seed_file).commitment != commitment or split.fingerprint != fingerprint:
         raise RsbenchError(f"{seed_file}: draws {split.name}, which announced.json beside it does not announce")
 
@@ -207,7 +207,7 @@ def _fill(
 
 
 def entries_of_laws() -> dict[str, list[str]]:
-    """Entries that come with rsbench, by protocol: one for each method, and the solver that selects a model."""
+    """Return rsbench's entries by protocol: one for each method, and the solver that selects a motion model."""
     first = entries_of_frames()
     solvers, readers = (
         [name for name in first[track] if name not in SAME_METHOD] + [CHOOSES] for track in ("pose", "readout")
@@ -216,9 +216,9 @@ def entries_of_laws() -> dict[str, list[str]]:
 
 
 def entries_of_frames() -> dict[str, list[str]]:
-    """Entries that come with rsbench and need no more than the inputs of the track, by track.
+    """Return, by track, rsbench's entries that need only the inputs of the track.
 
-    ``readout`` has those that look for a ratio: the maximum-likelihood ones of both cameras, which it takes alone.
+    On the track ``readout``, these are the maximum-likelihood solvers of both cameras, which estimate the ratio.
     """
 
     def own(kind: Kind[Any, Any]) -> list[str]:
@@ -236,9 +236,9 @@ def entries_of_frames() -> dict[str, list[str]]:
 def publish(
     board: Path, out: Path, command: str = "rsbench reproduce leaderboard", *, tables_alone: bool = False
 ) -> None:
-    """Write a board's site, or its tables alone, and by what command and code each entry was made.
+    """Write a board's site, or only its tables, and provenance.json with the command and code of each entry.
 
-    What is there of protocols that the board does not have stays: their tables do too.
+    Tables and provenance of splits that the board does not have are kept.
     """
     if tables_alone:
         with tempfile.TemporaryDirectory() as folder:
@@ -262,6 +262,6 @@ def publish(
         name: {key: record[key] for key in ("command", "commit", "source", "date") if key in record}
         for name, record in made.items()
         if isinstance(record, dict)
-        and not (name in former and "commit" not in record)  # restored from its predictions
+        and not (name in former and "commit" not in record)  # restored entries keep their former provenance
     }
     write_json(path, {**provenance(command), "entries": dict(sorted((kept | brief).items()))})

@@ -70,7 +70,7 @@ def sweeps(out: Path, data: Path, workers: int | None) -> None:
 
 
 def claims(out: Path, data: Path, workers: int | None) -> None:
-    """Every claim, in every reading of the paper's solver."""
+    """Judge every claim of the paper on simulated points, for every reading of its solver."""
     fig3(out, data, workers)
     folder, home, command = out / "claims", data / "simulated", "rsbench reproduce claims"
     tables = _claim_tables(out / "fig3", folder, home, workers, command)
@@ -91,7 +91,7 @@ def claims(out: Path, data: Path, workers: int | None) -> None:
 def _claim_tables(
     fig3_folder: Path, folder: Path, home: Path, workers: int | None, command: str
 ) -> dict[str, dict[str, pd.DataFrame]]:
-    """Summaries of the sweeps with all readings of the paper's solver, by matches per camera and sweep."""
+    """Run the sweeps with all readings of the paper's solver; return summaries by matches per camera and sweep."""
     hundred = read_summaries(fig3_folder, SWEEPS)
     tables: dict[str, dict[str, pd.DataFrame]] = {"100 + 100": {}, "9 + 9": {}}
     for name in SWEEPS:
@@ -108,8 +108,8 @@ def _claim_tables(
 
 
 def _with_readings(name: str, points: int | None, home: Path, workers: int | None, command: str) -> pd.DataFrame:
-    """Run a sweep of the paper with the readings of its solver; returns the summary. Unless there are 100 points,
-    as in Figure 3, the solvers for comparison are run too."""
+    """Run a sweep of the paper with the readings of its solver; return the summary. The solvers for comparison are
+    run too, unless there are 100 points, for which ``fig3`` runs them."""
     others = () if points == 100 else (OURS, GLOBAL)
     card = replace(load_sweep(name), solvers=(*write_cards(home / "readings", readings_of(name, points)), *others))
     folder = home / (f"{name}-readings" if points is None else f"{name}-{points}-readings")
@@ -119,7 +119,7 @@ def _with_readings(name: str, points: int | None, home: Path, workers: int | Non
 
 
 def readings(out: Path, data: Path, workers: int | None) -> None:
-    """The claims in settings that the paper does not state."""
+    """Judge the claims in settings that the paper leaves open."""
     folder, home, command = out / "readings", data / "simulated", "rsbench reproduce readings"
     chosen = (LITERAL, replace(LITERAL, extraction="symmetric"))
     solvers = (*write_cards(home / "readings", chosen), GLOBAL)
@@ -138,7 +138,7 @@ def readings(out: Path, data: Path, workers: int | None) -> None:
 
 
 def image_claims(out: Path) -> None:
-    """The claims about images, from the results that ``out`` holds."""
+    """Judge the claims about images from the results in ``out``."""
     text, page = image_claims_page(judge_image_claims(out)), out / "claims" / "images.md"
     write_bytes(page, text.encode())
     echo(f"claims: {page}")

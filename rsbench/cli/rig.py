@@ -242,7 +242,8 @@ def _record(found: Calibration) -> dict[str, Any]:
 
 
 def _rows_apart(rig: StereoRig) -> list[float] | None:
-    """Least and largest row difference, right minus left, of points at infinity in both images; None: none."""
+    """Return the range of row differences, right minus left, of points at infinity in both images; None if none is
+    in both."""
     import numpy as np
 
     left, right = rig.sensor("left"), rig.sensor("right")

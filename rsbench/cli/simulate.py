@@ -92,7 +92,7 @@ def run_and_summarise(
     time_limit_s: float | None = None,
     force: bool = False,
 ) -> pd.DataFrame:
-    """Run a sweep with a progress bar and write its summary and provenance; returns the summary."""
+    """Run a sweep with a progress bar, and write its summary and provenance; return the summary."""
     from rsbench.benchmark.provenance import provenance
     from rsbench.benchmark.simulated.run_sweep import run_sweep, summarise_sweep, sweep_steps
     from rsbench.storage.files import write_json
@@ -124,7 +124,7 @@ _SMALL = 0.1
 
 
 def show(card: SweepCard, table: pd.DataFrame) -> None:
-    """The medians of each variant, with their intervals, as a terminal table."""
+    """Print the medians of each variant, with their intervals, as terminal tables."""
     from rsbench.benchmark.simulated.run_sweep import SUCCESS_DEG
     from rsbench.benchmark.statistics import format_interval
 
@@ -156,7 +156,7 @@ def show(card: SweepCard, table: pd.DataFrame) -> None:
         for row in records:
             if row["failures"]:
                 say(f"{row['solver']}, {card.axis} = {row['value']:g}, failed: {row['failure_reasons']}")
-    rolling = table[table.shutter == "rolling"]  # with a global shutter, there is no time between rows
+    rolling = table[table.shutter == "rolling"]  # for a global shutter, the motion between rows has no effect
     for (solver, assumed), rows in rolling.groupby(["solver", "assumed_motion"], sort=False):
         others = sorted(set(rows.motion_model) - {assumed})
         if others:

@@ -99,7 +99,7 @@ def docs(
 
 
 def list_documents() -> dict[str, Path]:
-    """Paths by name, sorted: documents without their ending, examples with it."""
+    """Return paths by name: documents without their suffix, then examples with it, each sorted."""
     from rsbench.components.cards import shipped_folder
 
     examples = shipped_folder("examples", "_docs/examples")
@@ -109,7 +109,7 @@ def list_documents() -> dict[str, Path]:
 
 
 def _title(path: Path) -> str:
-    """The first heading of a document or notebook."""
+    """Return the first heading of a document or notebook."""
     for line in path.read_text("utf-8").splitlines():
         text = line.strip().lstrip('"').removesuffix(",").removesuffix('"').removesuffix("\\n")
         if text.startswith("# "):

@@ -147,7 +147,7 @@ def _show_one(answer: dict[str, Any]) -> None:
 
 
 def _readout(answer: dict[str, Any]) -> str:
-    """Text on the estimated shutter, and on the second most probable one."""
+    """Return text on the estimated shutter and the second most probable one."""
     found = answer["readout"]
     sides = [found["left"]] if found["left"] == found["right"] else [found["left"], found["right"]]
     text = f"ratio {answer['readout_ratio']:.3f} +- {found['readout_ratio_sigma']:.3f} from {' and '.join(sides)}"

@@ -126,8 +126,8 @@ def _reference_faults(folder: Path) -> list[str]:
 
 
 def _verify_others(folder: Path, layout: str) -> None:
-    """Check a dataset in another layout, as far as it has them: files, sizes, disparities, and depth and matches
-    by the poses and row times."""
+    """Check a dataset in another layout: files, sizes, and, if there are any, disparities, depth and matches, by
+    poses and row times."""
     from rsbench.interop.readers.check import NEAR_PX, agreements, disparity_faults, file_faults, sights
     from rsbench.interop.readers.layouts import read_others
 

@@ -299,7 +299,7 @@ def complete_depth(
     def side_depths(side: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         first, second = eight_bit([pair.images[side] for pair in pairs])
         known = pairs[0].depth[side], pairs[1].depth[side]
-        near = math.inf if rig.aligned else _nearest(known)
+        near = _nearest(known)
         found = depth_from_motion((first, second), known, rig, shutter, motion, side, frames, unsure, near)
         for frame in frames if unsure else ():
             pair = eight_bit([pairs[frame].images[each] for each in (side, *(s for s in SIDES if s != side))])

@@ -46,12 +46,12 @@ from rsbench.storage.work_folder import WORK, remove, work_folder
 
 FORMAT = 1
 RUN = "rsbench leaderboard run"
-"""Entries of this command may be replaced; submitted entries are never replaced silently."""
+"""Command whose entries may be replaced; submitted entries are replaced only on request."""
 ORACLES = "rsbench leaderboard oracles"
 OWN = (RUN, ORACLES)
-"""Commands whose entries rsbench makes itself."""
+"""Commands that make entries of rsbench's own methods."""
 FILES = ("predictions.jsonl", "scores.csv", "entry.json")
-"""Files of an entry; the last one is the record of the others."""
+"""Files of an entry; the last one describes the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +66,9 @@ class Recorded:
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the pictures and matches of its answers, by their paths below the entry."""
     doubt: str = ""
-    """Reason for doubts about the entry, see ``doubt.doubt_about``; empty if there are none."""
+    """Reason for doubts about the entry, see ``doubt_about``; empty if there are none."""
     accepted: str = ""
-    """Reason why the keeper of the board accepted an entry in spite of doubts."""
+    """Reason why the keeper of the board accepted the entry in spite of doubts; empty if it was not accepted."""
     made: dict[str, Any] = field(default_factory=dict)
     """Provenance: ``command``, version, machine."""
 
@@ -96,13 +96,13 @@ class Scored:
     files: dict[str, str]
     """SHA-256 of its pictures and matches, by paths below ``folder`` such as ``pictures/castle/left_1.exr``."""
     doubt: str
-    """Reason why it is not ranked; empty if it is."""
+    """Reason for doubts, because of which it is not ranked; empty if there are none, or it was accepted."""
     handed_in: bool
     """Whether the answers were submitted as a file; if not, this board ran the method."""
 
 
 def made_by(board: Path, split: Split, method: str) -> str:
-    """The command that made an entry; ``RUN`` if there is no such entry."""
+    """Return the command that made an entry; ``RUN`` if there is no such entry."""
     path = place(board, split.track.id, split.name) / "entries" / method / FILES[2]
     if not path.is_file():
         return RUN
@@ -111,7 +111,7 @@ def made_by(board: Path, split: Split, method: str) -> str:
 
 
 def move_entry(new: Path, folder: Path) -> None:
-    """Rename a finished entry from its work folder to its place; the old one is moved into the work folder."""
+    """Move a finished entry from the work folder to its place; an old entry there is moved to the work folder."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.is_symlink() or folder.exists():
         os.replace(folder, new.with_name(f"{new.name}~"))  # entries cannot have this name
@@ -119,7 +119,7 @@ def move_entry(new: Path, folder: Path) -> None:
 
 
 def place(board: Path, protocol: str, split: str) -> Path:
-    """Folder of a split."""
+    """Return the folder of a split."""
     return board / protocol / split
 
 
@@ -155,7 +155,7 @@ def write_split(board: Path, split: Split) -> None:
 
 
 def refuse_another(folder: Path, sha256: str, files: dict[str, str]) -> None:
-    """Raises RsbenchError if the folder holds an entry with other predictions."""
+    """Raise RsbenchError if the folder contains an entry with other predictions."""
     if not folder.is_dir():
         return
     there = read_json(folder / FILES[2])
@@ -167,7 +167,7 @@ def refuse_another(folder: Path, sha256: str, files: dict[str, str]) -> None:
 
 
 def refuse_same_but_case(entries: Path, method: str) -> None:
-    """Raises RsbenchError if a name differs from that of an entry only in case: some file systems ignore case."""
+    """Raise RsbenchError if a name differs from that of an entry only in case, which some file systems ignore."""
     for folder in _folders(entries):
         if folder.name != method and folder.name.lower() == method.lower():
             raise RsbenchError(
@@ -179,10 +179,10 @@ def refuse_same_but_case(entries: Path, method: str) -> None:
 
 
 def splits_of(board: Path) -> list[tuple[str, str]]:
-    """Protocols and names of the splits of a board, in the order of tracks.
+    """Return the protocol and name of each split of a board, in the order of tracks.
 
     Raises:
-        RsbenchError: the folder is no board.
+        RsbenchError: the folder is not a board.
     """
     _check_board(board)
     found: list[tuple[str, str]] = []
@@ -204,7 +204,7 @@ def about_split(folder: Path) -> About:
 
 
 def entries_of(board: Path, protocol: str, split: str) -> list[Scored]:
-    """Entries of a split, by name.
+    """Read the entries of a split, sorted by name.
 
     Raises:
         RsbenchError: an entry is damaged.
@@ -213,7 +213,7 @@ def entries_of(board: Path, protocol: str, split: str) -> list[Scored]:
 
 
 def _folders(folder: Path) -> Iterator[Path]:
-    """Folders below one that have valid names, sorted; links are left out."""
+    """Yield the subfolders with valid names, sorted; links are left out."""
     if folder.is_dir() and not folder.is_symlink():
         for path in sorted(folder.iterdir()):
             if NAME.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
@@ -235,7 +235,7 @@ def read_entry(folder: Path) -> Scored:
 
 
 def _read_record(folder: Path) -> Recorded:
-    """The record of an entry, checked against its folder and its predictions."""
+    """Read entry.json, and check it against the folder and the predictions of the entry."""
     for name in FILES:
         if (folder / name).is_symlink() or not (folder / name).is_file():
             raise RsbenchError(
@@ -273,7 +273,7 @@ def _read_scores(folder: Path, protocol_id: str) -> pd.DataFrame:
 
 
 def check_files(folder: Path, files: dict[str, str], found: dict[str, str]) -> None:
-    """Raises RsbenchError if the SHA-256 ``found`` of the files of an entry differ from the recorded ones."""
+    """Raise RsbenchError if the SHA-256 ``found`` of an entry's files differ from the recorded ``files``."""
     for name, digest in files.items():
         if found[name] != digest:
             raise RsbenchError(
@@ -288,7 +288,7 @@ def rescore(
     ``Track.mark``.
 
     Returns:
-        For each entry with different scores, the columns that changed; all columns if there was no table.
+        The columns that changed, by entry, for entries with different scores; all columns if there was no table.
 
     Raises:
         RsbenchError: stored predictions are invalid, or belong to another entry.
@@ -315,7 +315,7 @@ def rescore(
 
 
 def accept(board: Path, protocol: str, split: str, method: str, reason: str) -> str:
-    """Accept an entry in spite of doubts, so that it is ranked; returns the reason for the doubts.
+    """Accept an entry in spite of doubts, so that it is ranked; returns the text of the doubts.
 
     Raises:
         RsbenchError: there is no such entry, or there are no doubts about it.
@@ -332,7 +332,7 @@ def accept(board: Path, protocol: str, split: str, method: str, reason: str) -> 
 
 
 def _stored(folder: Path, split: Split) -> Submission:
-    """The predictions of an entry, checked against their recorded hashes."""
+    """Read the predictions of an entry, and check its files against the recorded hashes."""
     record, path = _read_record(folder), folder / FILES[0]
     found = {name: hashlib.sha256(file_bytes(folder, name)).hexdigest() for name in record.files}
     check_files(folder, record.files, found)
@@ -349,14 +349,14 @@ class _Taken(NamedTuple):
     """A file of predictions that is being added to a board."""
 
     submission: Submission
-    """Its copy in the folder where the entry is made."""
+    """The submission, with the work folder of the new entry as its folder."""
     data: bytes
     files: dict[str, str]
-    """The same as in ``Recorded``."""
+    """SHA-256 of its pictures and matches, as in ``Recorded``."""
 
     @property
     def identity(self) -> list[Any]:
-        """Everything that determines its scores apart from the split."""
+        """Hashes of all data that determine its scores, apart from the split."""
         return [hashlib.sha256(self.data).hexdigest(), sorted(self.files.items())]
 
 
@@ -397,11 +397,11 @@ def add_all(
     workers: Workers = 1,
     step: Step = lambda word: None,
 ) -> list[Scored]:
-    """``add`` for several files, which share intermediate results of the truth; ``replace`` decides by the name of
-    the method.
+    """Add several files as ``add`` does; they share intermediate results of the truth. ``replace`` is called with
+    the name of a method.
 
     Raises:
-        RsbenchError: as ``add``; the valid files are added to the board first.
+        RsbenchError: as for ``add``; the valid files are added to the board first.
     """
     read, faults = _read_all(files, split)
     if not read and faults:
@@ -437,7 +437,7 @@ def add_all(
 
 
 def _read_all(files: Iterable[Path], split: Split) -> tuple[list[tuple[Submission, bytes]], list[RsbenchError]]:
-    """Valid submissions with the content of their files, and the errors of the others."""
+    """Return the valid submissions with the content of their files, and the errors of the other files."""
     read, faults = list[tuple[Submission, bytes]](), list[RsbenchError]()
     for file in files:
         try:
@@ -448,7 +448,7 @@ def _read_all(files: Iterable[Path], split: Split) -> tuple[list[tuple[Submissio
 
 
 def _put(taken: _Taken, scores: pd.DataFrame, split: Split, made: dict[str, Any], entries: Path) -> Scored:
-    """Write an entry into a work folder, and rename it to its place."""
+    """Write an entry into its work folder, and move it to its place."""
     header, new = taken.submission.header, taken.submission.folder
     new.mkdir(parents=True, exist_ok=True)
     write_bytes(new / FILES[0], taken.data)
@@ -477,7 +477,7 @@ def merge(other: Path, board: Path) -> list[str]:
     board accepted are in doubt again, until the keeper of this one decides.
 
     Raises:
-        RsbenchError: two entries of one name have different predictions; one of the folders is no board, or is
+        RsbenchError: entries with the same name have different predictions; a folder is not a board, or is
             damaged.
     """
     theirs = [
@@ -505,7 +505,7 @@ def merge(other: Path, board: Path) -> list[str]:
 
 
 def _copy(scored: Scored, new: Path) -> None:
-    """Copy an entry of another board, without unknown files in its folder."""
+    """Copy the known files of an entry of another board, without its acceptance."""
     new.mkdir(parents=True)
     for name in FILES:
         write_bytes(new / name, read_bytes(scored.folder / name))
@@ -522,7 +522,7 @@ SUFFIX = ".jsonl.xz"
 def store(board: Path, protocol: str, split: str, out: Path, methods: Collection[str] | None = None) -> list[Path]:
     """Write the predictions of each entry of a split as ``<method>.jsonl.xz``; returns the files.
 
-    ``methods``: only of these entries.
+    ``methods``: names of the entries to write; by default all.
 
     Raises:
         RsbenchError: an entry is damaged, or a file cannot be written.
@@ -544,7 +544,7 @@ def restore(
     """Add the predictions that ``store`` wrote for this split to a board, scored by the current code.
 
     Args:
-        part: the same split with fewer problems: only these are then scored.
+        part: the same split with fewer problems; if it is given, only these are scored.
         step: called with the name of each method.
 
     Raises:
@@ -567,7 +567,7 @@ def restore(
 
 
 def _only(data: bytes, split: Split, part: Split, where: str) -> bytes:
-    """Predictions of a split, restricted to the problems of a part of it."""
+    """Restrict the predictions of a split to the problems of a part of it."""
     header, *answers = (parse_json(line, where) for line in data.decode().splitlines())
     if header.get("split") == split.name:
         header["split"] = part.name
@@ -585,16 +585,16 @@ def _unpacked(file: Path) -> bytes:
 
 
 COVERAGE = 0.999
-"""Coverage of the interval that must exclude one half: 1 of 2000 unbiased methods at the bound is put in doubt."""
+"""Coverage of the interval that must exclude 0.5; it puts 1 of 2000 unbiased methods at the bound in doubt."""
 _EXACT_SHARE = 0.1
-"""Largest share of problems in which an error may be zero up to rounding."""
+"""Largest allowed share of problems in which an error is zero up to rounding."""
 _ORACLES = (ORACLE, "cramer-rao", "constant", "uncorrected", "fusion-true")
 _BUILT_IN = ("rs-stereo", "rs-stereo-auto", "sgm", "sweep", "fusion")
 """Names of former entries, in addition to those of cards."""
 
 
 def outline(name: str) -> str:
-    """A name reduced to its appearance: without case and separators, and with 0 = o and 1 = i = l."""
+    """Normalise a name, so that similar-looking names are equal: lower case, one separator, 0 = o, 1 = i = l."""
     return re.sub("[._-]+", "-", name.lower()).strip("-").translate(str.maketrans("01i", "oll"))
 
 
@@ -619,13 +619,13 @@ def refuse_reserved(header: Header, where: str) -> None:
 
 
 def doubt_about(scores: pd.DataFrame, header: Header, split: Split) -> str:
-    """The reason why an entry is in doubt, in one line; empty if it is not.
+    """Return the reason why an entry is in doubt, in one line; empty if it is not.
 
-    Such an entry is more accurate than its data allow, and is not ranked until the board's keeper accepts it: an
-    error is zero up to rounding in a tenth of the problems, or errors are below the Cramer-Rao bound of the data
-    that the method states to use. The error of an unbiased method is below the median at the bound in at most half
-    of the problems. Each error of a track is tested separately. If no bound is known, as for rendered frames, a
-    submission of the true values with a small error is not detected; to be sure, the keeper must run the method.
+    An entry in doubt is more accurate than its data allow, and is not ranked until the board's keeper accepts it.
+    Either an error is zero up to rounding in more than a tenth of the problems, or errors are below the Cramer-Rao
+    bound of the inputs in ``header.uses``: the error of an unbiased method is below the median at the bound in at
+    most half of the problems. Each error of a track is tested separately. If no bound is known, as for rendered
+    frames, a submission of the true values plus a small error is not detected; the keeper must run the method.
     """
     if ORACLE in header.uses:
         return ""

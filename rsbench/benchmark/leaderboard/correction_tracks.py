@@ -1,7 +1,7 @@
 """Tracks of corrected frames; docs/reference/protocols.md has the formulas, which ``rsbench.vision`` implements.
 
-Pixels that a method did not draw are black, so that leaving out difficult pixels does not raise a score. Entries
-that the board makes itself close narrow holes, as the command does.
+Pixels that a method did not draw are black, so that leaving out difficult pixels does not raise a score. In
+rsbench's own entries narrow holes are closed, as by ``rsbench correct``.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ from rsbench.vision.quality import (
 )
 
 Frame = tuple[NDArray[np.uint8], NDArray[np.bool_]]
-"""An image (H, W, 3) and the mask (H, W) of drawn pixels."""
+"""An image (H, W, 3) and the mask (H, W) of pixels that the method drew."""
 _PIXELS = ("", "_covered", "_all")
-"""Suffixes of columns: common pixels, drawn pixels, all pixels."""
+"""Suffixes of the columns of scores over common pixels, drawn pixels, and all pixels."""
 _WORST_FRAME: Numbers = {
     **{f"{name}{end}": 0.0 for name in ("ssim", "psnr") for end in _PIXELS},
     **{f"flip_{part}": 1.0 for part in ("common", "covered", "all")},
@@ -120,7 +120,7 @@ def _uncorrected(pictures: TruePictures, place: Path) -> None:
 
 
 def _best(pictures: TruePictures, place: Path) -> None:
-    """The default corrector with the true motion and depth."""
+    """Write the frames of the default corrector with the true motion and depth."""
     sequence = pictures.sequence
     images = {view: sequence.image("rs", *view) for view in VIEWS}
     given = Given(motion=sequence.motion, pairs=true_pairs(sequence, images))
@@ -133,17 +133,17 @@ def _best(pictures: TruePictures, place: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CorrectionTrack(PictureTrack):
-    """Rolling-shutter frames as a global shutter would have taken them."""
+    """A track of frames corrected from a rolling to a global shutter."""
 
     rows: tuple[str, ...] = ("first", "middle")
-    """Rows whose times are requested, if the dataset has the truth for them."""
+    """Rows to whose times frames must be corrected, if the dataset has the truth for them."""
     flips: bool = True
     """Whether FLIP is among the scores."""
     at_rows = True
     part_score, part_title = "rms", "RMS error of the common pixels, of 255"
 
     def requested(self, sequence: Rendered) -> tuple[RequestedPicture, ...]:
-        """The pictures of the first row, and of the other rows for which the dataset has the truth."""
+        """Return the pictures for the first row, and for the other rows for which the dataset has the truth."""
         side, frame = VIEW
         lines = sequence.shutter.lines(side)
         numbers = {"first": 0, "middle": lines // 2, "last": lines - 1}
@@ -174,7 +174,7 @@ class CorrectionTrack(PictureTrack):
         return found
 
     def scores_of(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
-        """Means over the requested frames, also of dB; FLIP takes most of the time."""
+        """Return means over the requested frames, for PSNR those of the values in dB."""
         scores, images = list[Numbers](), list[NDArray[np.uint8] | None]()
         for number, one in enumerate(true):
             image, mask = (None, None) if drawn is None else drawn[number]
@@ -213,7 +213,7 @@ class CorrectionTrack(PictureTrack):
         return {"seconds": round(seconds, 4)}
 
     def corrected(self, work: SharedWork, chain: CorrectionOptions) -> tuple[list[dict[View, Fused]], float]:
-        """The frame at the time of each requested row, and the seconds for this correction alone.
+        """Correct the frame to the time of each requested row; also return the run time of this entry alone, s.
 
         Raises:
             RsbenchError: the frame cannot be corrected.
@@ -261,9 +261,9 @@ class TrueFrame:
     name: str
     """Name of the row: ``first``, ``middle`` or ``last``."""
     picture: Picture
-    """(H, W, 3) of a global shutter."""
+    """(H, W, 3) image of a global shutter."""
     common: NDArray[np.bool_]
-    """(H, W) see ``TruePictures.common``."""
+    """Mask (H, W) of common pixels, see ``TruePictures.commons``."""
     parts: Parts
     """Named parts of the common pixels."""
 
@@ -279,7 +279,7 @@ def _frame(image: NDArray[np.uint8], drawn: NDArray[np.bool_], true: TrueFrame, 
     found["epe_px"] = float(np.mean(off)) if off.size else math.inf
     found["ssim_deepunroll"] = ssim_deepunroll(drawing, truth)
     found["ssim_uniform"] = ssim_uniform(drawing, truth)
-    # Without counted pixels there is no value; a negative SSIM counts as 0.
+    # A mask without pixels gives NaN, which becomes the worst value; a negative SSIM counts as 0.
     found = {key: _WORST_FRAME[key] if math.isnan(value) else value for key, value in found.items()}
     found |= {key: max(value, 0.0) for key, value in found.items() if key.startswith("ssim")}
     return {**found, **(_flips(image, truth.image, masks) if flips else {})}
@@ -322,7 +322,8 @@ def _mistakes(
 
 
 def _squared(image: NDArray[Any], truth: NDArray[np.uint8]) -> float:
-    """Mean squared difference of the pixels that are not black, without the border, which shifts fill."""
+    """Return the mean squared difference of the pixels that are not black, without the border, because shifted
+    images wrap around."""
     counted = np.any(image > 0, axis=-1)
     counted[[0, -1]] = counted[:, [0, -1]] = False
     difference = image[counted].astype(np.float32) - truth[counted]
@@ -332,9 +333,9 @@ def _squared(image: NDArray[Any], truth: NDArray[np.uint8]) -> float:
 # Scores by the position of the content in corrected frames
 #
 # Noise, blur and vignetting do not depend on the shutter, but determine most of the SSIM of a real sensor.
-# Therefore equally blurred windows of frame and truth are shifted against each other to the maximum of their
-# correlation, and the length of the shift is scored. Dense flow is not accurate enough: on noisy frames its errors
-# are as large as those of a corrected frame. Phase correlation would undo the blur.
+# Therefore windows of the blurred truth are found in the blurred frame by template matching, and the length of
+# their displacement is scored. Dense flow is not accurate enough: on noisy frames its errors are as large as those
+# of a corrected frame. Phase correlation would undo the blur.
 
 LIMIT_PX = 2.0
 """Displacement at which, and above which, the score of a window is 0."""
@@ -353,7 +354,7 @@ _LEAST = 0.25
 
 
 class PlacedTrack(CorrectionTrack):
-    """Frames that a global shutter would have taken, ranked by geometry."""
+    """A track of corrected frames, ranked by the position of their content."""
 
     def chain(self, card: str) -> CardChain:
         return super().chain(card).choosing()
@@ -364,10 +365,10 @@ class PlacedTrack(CorrectionTrack):
 
 
 class SensorTrack(PlacedTrack):
-    """Frames that the same sensor would have taken with a global shutter."""
+    """A track of corrected frames whose truth is the image of the same sensor with a global shutter."""
 
     def requested(self, sequence: Rendered) -> tuple[RequestedPicture, ...]:
-        """The truth is the image of the same sensor with a global shutter and without noise.
+        """Return the pictures, whose truth is the noise-free image of the same sensor with a global shutter.
 
         Raises:
             RsbenchError: the dataset has a sensor, but no such images.
@@ -462,16 +463,16 @@ def _blurred(image: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 # Tracks of one camera
 #
-# The inputs of a corrector are estimated from the two frames of this camera, by dense flow: matches, and a motion
-# whose translation has no scale. Correctors that need the depth of a rig run in the chain of ``correction``; their
-# entries state that they use the other camera, which shows its benefit.
+# The inputs of a corrector, matches and a motion without the scale of its translation, are estimated by dense flow
+# from the two frames of this camera. Correctors that need the depth of a rig run as on the track ``correction``;
+# their entries state that they use the other camera, and show its benefit.
 
 _SIDE = VIEW[0]
 _LAST = {"key": "psnr_last", "title": "PSNR last", "hint": "of the last row's time, common pixels"}
 
 
 class OneCameraTrack(CorrectionTrack):
-    """Frames of one camera that a global shutter would have taken."""
+    """A track of corrected frames of one camera."""
 
     def chain(self, card: str) -> CardChain:
         made = super().chain(card)
@@ -505,10 +506,10 @@ def _needs_rig(spec: CorrectorSpec) -> bool:
 
 
 def _from_left(work: SharedWork, chain: CorrectionOptions) -> Given:
-    """Matches of the left camera over time, and its motion, whose translation has length 1.
+    """Estimate matches of the left camera over time and its motion, whose translation has length 1.
 
     Raises:
-        RsbenchError: its frames determine no motion.
+        RsbenchError: the frames do not determine a motion.
     """
     start = time.perf_counter()
     frames = [work.images[_SIDE, frame] for frame in FRAMES]
@@ -577,7 +578,7 @@ OF_SENSORS: dict[str, Any] = _RIG | {
     "error_title": "1 - placed x picture",
     "beside": ("placed", "picture", "failure"),
 }
-"""Fields of a track of frames that the same sensor would have taken with a global shutter."""
+"""Fields of a ``SensorTrack``."""
 TRACKS: tuple[Track, ...] = (
     SensorTrack(
         **OF_SENSORS,

@@ -1,6 +1,6 @@
-"""The track of depth maps: formulas of docs/reference/protocols.md, those of ``rsbench.vision``.
+"""The track of depth maps; docs/reference/protocols.md has the formulas, which ``rsbench.vision`` implements.
 
-Unknown depth counts as wrong, so that leaving out difficult pixels does not pay.
+Unknown depth counts as wrong, so that leaving out difficult pixels does not raise a score.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ _WORST_PART: Numbers = {
     "rmse_m": math.inf,
 }
 _NEAR = 0.1
-"""Relative error of depth below which another interpretation matches the ground truth."""
+"""Largest median relative error with which a depth map, after undoing a mistake, agrees with the truth."""
 _RIGHT = 0.01
-"""Relative error below which no likely mistake is reported."""
+"""Median relative error below which no likely mistake is reported."""
 _SMALLER = 0.25
 """A likely mistake is reported if undoing it reduces the error below this share."""
 _FAR_M = 300.0
@@ -90,7 +90,7 @@ def _flat(pictures: TruePictures, place: Path, depth_m: float) -> None:
 
 
 class DepthTrack(PictureTrack):
-    """Depth of a rolling-shutter frame."""
+    """A track of depth maps of rolling-shutter frames."""
 
     part_score, part_title = "bad_1", "bad@1"
 
@@ -156,7 +156,7 @@ class DepthTrack(PictureTrack):
 
 
 def _motion(work: SharedWork, chain: CorrectionOptions) -> Motion:
-    """The motion that the default solver estimates, the same for all matchers.
+    """Estimate the motion with the default solver; it is the same for all matchers, and computed once.
 
     Raises:
         RsbenchError: see ``match_frames``, ``know_matches`` and ``solve_frames``.
@@ -183,13 +183,13 @@ class TrueDepth:
     depth: NDArray[np.float32]
     """(H, W) m, 0 where there is no surface."""
     seen: NDArray[np.bool_]
-    """(H, W) by both cameras."""
+    """(H, W) pixels whose scene point both cameras see."""
     parts: Parts
     """Parts of the surface."""
 
 
 def _wrong(depth: NDArray[np.float32], truth: NDArray[np.float32], rig: StereoRig) -> NDArray[np.bool_]:
-    """(H, W) pixels of a surface whose disparity is unknown or wrong by more than 1 px."""
+    """Return the mask (H, W) of pixels with unknown disparity, or wrong by over 1 px; valid only on surfaces."""
     found, true = (rig.disparity(np.where(each > 0.0, each, 1.0).astype(np.float64)) for each in (depth, truth))
     return (depth <= 0.0) | (np.abs(found - true) > 1.0)
 
@@ -197,7 +197,7 @@ def _wrong(depth: NDArray[np.float32], truth: NDArray[np.float32], rig: StereoRi
 def part_scores(
     depth: NDArray[np.float32] | None, truth: NDArray[np.float32], rig: StereoRig, part: NDArray[np.bool_]
 ) -> Numbers:
-    """Scores of some pixels. Without a surface among them no pixel is wrong, and errors in metres are NaN."""
+    """Return the scores of the pixels in ``part``; if none has a surface, shares are perfect and errors NaN."""
     if depth is None:
         return _WORST_PART
     surface = part & (truth > 0.0)
@@ -251,7 +251,7 @@ def _mistakes(depth: NDArray[np.float32], pictures: TruePictures) -> Iterator[st
 
 
 def _error(depth: FloatArray, truth: FloatArray) -> float:
-    """Median relative error."""
+    """Return the median relative error of depth."""
     return float(np.median(np.abs(depth - truth) / truth)) if truth.size else np.inf
 
 

@@ -36,7 +36,7 @@ OF_ANY_RIG = ("baseline", "readout_ratio")
 
 
 def check_place(split: Split, out: Path) -> None:
-    """Raises RsbenchError if a folder contains anything but inputs of this split, or a truth that is secret."""
+    """Raise RsbenchError if a folder contains anything but inputs of this split, or its secret truth."""
     others = [path.name for path in out.iterdir() if path.name != HIDDEN] if out.is_dir() else []
     record = (read_record(out / "split.json") or {}) if others else split_record(split)
     reveals = not split.public and "truth.jsonl" in others
@@ -62,7 +62,7 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
     write_matches(given, out)
     save_arrays(out / "problems.npz", _arrays(given, columns))
     if split.track.at_rows:
-        # Each corrected frame of an answer, with the row whose time it shows, and that time.
+        # Each requested picture, the row to whose time it is corrected, and this time.
         rows = (
             (truth.name, each.stem, each.row, float(truth.shutter.time_after(each.row, VIEW[1], VIEW[0])))
             for truth in split.truths
@@ -75,8 +75,8 @@ def write_inputs(split: Split, problems: Iterable[Problem], out: Path) -> None:
 
 
 def write_matches(problems: Sequence[Problem], out: Path) -> None:
-    """Write ``left.csv`` and similar files, with the name of its problem in each row; a set without matches gets
-    no file.
+    """Write ``left.csv`` and similar files, whose rows begin with the name of the problem; an empty set has no
+    file.
 
     Raises:
         RsbenchError: a file cannot be written.
@@ -89,7 +89,7 @@ def write_matches(problems: Sequence[Problem], out: Path) -> None:
 
 
 def split_record(split: Split) -> dict[str, Any]:
-    """The information on a split that is published before anything is scored."""
+    """Return the properties of a split that are published before anything is scored."""
     return {
         "protocol": split.track.id,
         "split": split.name,
@@ -114,7 +114,7 @@ def _rig(problem: Problem, columns: Sequence[str]) -> tuple[float, ...]:
 
 
 def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
-    """A CSV file; numbers have all their digits."""
+    """Return the content of a CSV file, with all digits of the numbers."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -123,8 +123,8 @@ def _csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
 
 
 def _arrays(problems: list[Problem], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Arrays: ``names`` (n,), ``rig`` (n, k columns); sets (m, 4 or 8), ``<set>_problem`` (m,): index of the
-    problem of each row."""
+    """Return ``names`` (n,), ``rig`` (n, k columns) and, for each set of matches, its rows (m, 4 or 8) and
+    ``<set>_problem`` (m,), the index of the problem of each row."""
     arrays: dict[str, NDArray[Any]] = {
         "names": np.array([problem.name for problem in problems]),
         "rig": np.array([_rig(problem, columns) for problem in problems]),
@@ -143,7 +143,7 @@ def write_frames(split: Split, out: Path) -> None:
     """Copy the rolling-shutter frames, as ``frames/<problem>/left_0.png`` to ``right_1.png``.
 
     Raises:
-        RsbenchError: a frame is missing, is not that of the split, or cannot be written.
+        RsbenchError: a frame is missing, differs from that of the split, or cannot be written.
     """
     for truth in split.truths:
         if truth.pictures is not None:
@@ -152,7 +152,7 @@ def write_frames(split: Split, out: Path) -> None:
         sequence, folder = truth.rendered, out / "frames" / truth.name
         folder.mkdir(parents=True, exist_ok=True)
         for side, frame in VIEWS:
-            sequence.image("rs", side, frame)  # that it can be read
+            sequence.image("rs", side, frame)  # raises an error if the frame is damaged
             path = inside(sequence.folder, picture_file("rs", side, frame + sequence.first))
             write_bytes(folder / f"{side}_{frame}.png", read_bytes(path))
 
@@ -161,7 +161,7 @@ def read_frames(inputs: Path, problem: Problem) -> Images:
     """Read the frames of a problem that ``write_frames`` wrote.
 
     Raises:
-        RsbenchError: one is missing, or is no image of its camera's size.
+        RsbenchError: a frame is missing, or is not an image of its camera's size.
     """
     folder = inputs / "frames" / problem.name
     sizes = {side: (camera.width, camera.height) for side in SIDES for camera in [problem.rig.sensor(side)]}
@@ -177,7 +177,7 @@ def prepare_inputs(split: Split, data: Path | None, seed_file: Path | None, fold
         folder: created if missing.
 
     Raises:
-        RsbenchError: as ``write_frames`` and ``write_inputs``.
+        RsbenchError: see ``write_frames`` and ``write_inputs``.
     """
     stored = read_record(folder / "split.json")
     if stored is None or stored.get("fingerprint") != split.fingerprint:
@@ -188,10 +188,10 @@ def prepare_inputs(split: Split, data: Path | None, seed_file: Path | None, fold
 
 
 def read_inputs(inputs: Path, track: Track) -> list[Problem]:
-    """Read the exported problems; if the readout ratio is not given, it is 0.
+    """Read the exported problems; on tracks that do not give the readout ratio, it is set to 0.
 
     Raises:
-        RsbenchError: they are missing, or damaged.
+        RsbenchError: the file is missing or damaged.
     """
     path = inputs / "problems.jsonl"
     unknown: dict[str, float] = {} if track.gives_readout else {"readout_ratio": 0.0}

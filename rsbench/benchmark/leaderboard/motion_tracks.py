@@ -1,9 +1,9 @@
 """Tracks of motions: from simulated matches, from given matches of frames, and from frames alone.
 
 If methods find matches themselves, they may submit these too: ``matches/left.csv`` and similar files beside the
-file of answers, with the columns of the given matches that ``export pose`` writes. The true second end of a match
-is the place where the other frame sees the surface point of its first end. It is computed from the true depth,
-interpolated between pixels by a plane, and from the true motion, with each end at the time of its own row.
+file of answers, with the columns of the matches that ``export pose`` writes. The true second pixel of a match is
+the projection of the scene point at its first pixel into the other frame. It is computed from the true depth,
+interpolated between pixels by a plane, and from the true motion, with each pixel at the time of its own row.
 """
 
 from __future__ import annotations
@@ -83,13 +83,13 @@ from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.stereo_matcher import between_pixels
 
 CHOOSES = "rs-stereo-auto"
-"""Name of the entry that chooses the motion model by the matches, as ``rsbench solve`` does."""
+"""Name of the entry that selects the motion model by the matches, as ``rsbench solve`` does."""
 AUC_DEG = (1, 5, 10)
 """Thresholds of the areas under the curve of max(e_R, e_T)."""
 FLIP_DEG = 90.0
 """A larger error of the direction counts as a flipped sign."""
 SUCCESS_DEG = (1.0, 5.0)
-"""Largest errors of rotation and direction of a success, as in the sweeps of simulated points."""
+"""Limits of the errors of rotation and direction for a success, as in the sweeps of simulated points."""
 BOUND = "cramer-rao"
 """Name of the entry whose errors are drawn from the bound."""
 OPEN_DEG = 10.0
@@ -107,16 +107,16 @@ _ANSWER_KEYS = (
     *("name", "success", "reason", "w", "d", "metric", "reference_point", "direction_known", "covariance"),
     "seconds",
 )
-"""Keys of an answer of ``solve_problem`` that are stored."""
+"""Keys of the answers of ``solve_problem`` that are stored."""
 _TIMES = 33
-"""Row times, from the first row of frame 0 to the last of frame 1, at which poses are compared."""
+"""Number of times, from the first row of frame 0 to the last row of frame 1, at which poses are compared."""
 _DECADES = 2.0
 _AREAS_DEG = (0.1, 1.0)
-"""Limits of e_R and of e_T in pose-2: rotations are ten times as accurate."""
+"""Thresholds of the areas under the curves of e_R and e_T in pose-2; rotations are ten times as accurate."""
 _DRAWS = 4000
 """Number of errors that are drawn at a bound: their median is then accurate to 3 %."""
 _RIGHT_PX = 1.0
-"""Largest distance of the second end of a right match from the truth."""
+"""Largest distance of the second pixel of a correct match from the truth."""
 _MATCH_FILES = tuple(f"{key}.csv" for key in COLUMNS)
 _LARGEST_PX = 1e6
 """Limit of coordinates, px: larger than any image."""
@@ -154,10 +154,10 @@ _OWN_MATCHES = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SolverTrack(Track):
-    """A track whose cards are solvers, and whose answers are lines of numbers."""
+    """A track whose cards are solvers, and whose answers are numbers in the file of answers alone."""
 
     choosing: bool = False
-    """Whether there is an entry ``CHOOSES``, and headers state the motion model of every entry."""
+    """Whether there is an entry ``CHOOSES``, and every header has the motion model of its solver."""
     more_columns: Callable[[list[Row], Submission, Split], None] | None = None
     """Function that adds columns to the rows of a submission."""
     also_uses: ClassVar[tuple[str, ...]] = ()
@@ -165,17 +165,17 @@ class SolverTrack(Track):
 
     @abstractmethod
     def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
-        """The answer of a solver to a problem, as a line of a submission."""
+        """Return the answer of a solver to a problem, as a line of a submission."""
 
     @abstractmethod
     def row(self, truth: Truth, answer: Answer | None) -> Row:
-        """Scores of an answer to one problem."""
+        """Return the scores of an answer to one problem."""
 
     def chunk(self, limits: Limits) -> int:
         return CHUNK if limits == Limits() else 1
 
     def entry_of(self, card: str) -> SolverEntry:
-        """Raises RsbenchError: no such solver."""
+        """Load the solver of a card; RsbenchError if it does not exist."""
         if card != CHOOSES or not self.choosing:
             return load_solver_entry(card)
         entry = load_solver_entry("rs-stereo-refined")
@@ -185,7 +185,7 @@ class SolverTrack(Track):
         return replace(entry, name=CHOOSES, description=words, key=f"{entry.key} {AUTO}", options=options)
 
     def check_entry(self, entry: SolverEntry) -> None:
-        """Raises RsbenchError when a solver does not fit the track."""
+        """Raise RsbenchError if a solver does not fit the track."""
         with naming(f"solver {entry.name!r}"):
             self.check_uses(uses_of(entry, self.gives_readout))
 
@@ -218,7 +218,7 @@ class SolverTrack(Track):
         return solve
 
     def rows(self, submission: Submission, split: Split) -> list[Row]:
-        """Scores of each problem."""
+        """Return the scores of each problem."""
         rows = [self.row(each, submission.answers.get(each.name)) | self.part_of(each) for each in split.truths]
         if self.more_columns is not None:
             self.more_columns(rows, submission, split)
@@ -231,13 +231,13 @@ class SolverTrack(Track):
 
 
 def uses_of(entry: SolverEntry, readout: bool = True) -> tuple[str, ...]:
-    """The inputs that a solver declares, on a track that does or does not give the ``readout`` ratio."""
+    """Return the inputs that a solver declares; ``readout``: whether the track gives the readout ratio."""
     rolling = entry.solver.spec.shutter == "rolling" and readout
     return _USES[enter(entry).information] + (("readout",) if rolling else ())
 
 
 def seed_of_answer(problem: Problem, entry: SolverEntry) -> int:
-    """Seed from the names of problem and solver, so that answers do not depend on order or workers."""
+    """Return a seed from the names of problem and solver, so that answers do not depend on order or workers."""
     text = f"leaderboard {problem.name} {entry.name}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
@@ -259,7 +259,7 @@ class _Motion(Answer):
     """An answer that is a motion."""
 
     motion_model: str = ""
-    """Motion model by which the motion was found, where the method chooses one."""
+    """Motion model that the method selected, if it selects one."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -333,7 +333,7 @@ def _mistaken(answers: Sequence[Answer], split: Split) -> tuple[str, int] | None
 
 
 def motion_row(truth: Truth, answer: Answer | None) -> Row:
-    """Scores of an answer to one problem."""
+    """Return the scores of an answer to one problem."""
     w, d = _vectors(answer)
     success = answer is not None and bool(answered(w, d, answer.success))
     point = "body" if answer is None else answer.reference_point
@@ -384,7 +384,7 @@ def _true_d(truth: Truth, point: str) -> FloatArray:
 
 
 def _row_angle(w: FloatArray, truth: Truth) -> float:
-    """Largest angle between the true pose of a row and a uniform rotation by ``w``, degrees."""
+    """Return the largest angle, degrees, between the true rotation at a row and a uniform rotation by ``w``."""
     times = np.linspace(0.0, 1.0 + truth.shutter.readout_ratio, _TIMES)
     estimated = so3.exp(times[:, None] * w)
     true = truth.motion.body_from_world(times).R
@@ -396,10 +396,11 @@ def _row_angle(w: FloatArray, truth: Truth) -> float:
 
 @lru_cache(maxsize=8)
 def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str, FloatArray]:
-    """Compute ``Track.medians_at_bound`` for Gaussian errors in the first ``count`` problems, as bounds are slow.
+    """Compute ``Track.medians_at_bound`` of the first ``count`` problems for Gaussian errors; cached, as it is
+    slow.
 
-    A method is compared with the bound for the inputs that it uses; the readout ratio counts as given. The
-    direction is that of the body's translation, or of the left camera's if only this camera is used.
+    ``seen`` is ``left``, ``both`` or ``links``, the matches that a method uses; the readout ratio counts as given.
+    The direction is that of the body's translation, or of the left camera's if only this camera is used.
     """
     bounds = list[Bound]()
     views: Views = "four-view" if seen == "links" else "pairs"
@@ -419,8 +420,8 @@ def bound_medians(draws: Draws, seed: int, count: int, seen: str) -> Mapping[str
 
 
 def smooth(motion: Motion) -> Motion:
-    """Return a smooth motion for a bound: a spline with vibrations is replaced by the twist around which it
-    vibrates, which changes the bound by less than 5 %.
+    """Return a smooth motion for a bound: a spline or a path through poses is replaced by the twist with the same
+    end pose. For a vibrating spline this changes the bound by less than 5 %.
 
     The derivatives of a spline by its end pose are 100 times slower, and a path through given poses has none.
     """
@@ -437,8 +438,8 @@ def _median(axes: FloatArray, draws: FloatArray) -> float:
 def bound_text(split: Split, folder: Path) -> str:
     """Return a submission of motions with the smallest errors that the data allow.
 
-    The errors are drawn from the Cramer-Rao bound of the matches without the outliers: the best possible result of
-    an unbiased method that knows the outliers and uses all links.
+    The errors are drawn from the Cramer-Rao bound of all inliers: the best possible result of an unbiased method
+    that knows the outliers and uses all links.
     """
     words = "The true motion with errors drawn from the Cramer-Rao bound of all that is no outlier"
     return submission_text(method_header(split, BOUND, [ORACLE], words), _at_the_bound(split))
@@ -467,13 +468,14 @@ def _at_the_bound(split: Split) -> Iterator[dict[str, Any]]:
 
 
 def nearness(over: FloatArray) -> FloatArray:
-    """Return scores of ratios (...) of errors to medians at the bound: 1 up to 1, 0 from 100 on, log-linear."""
+    """Return the scores of ratios (...) of errors to their medians at the bound: 1 for ratios up to 1, 0 from a
+    ratio of 100 on, and linear in the logarithm between them."""
     with np.errstate(divide="ignore"):
         return np.clip(1.0 - np.log10(over) / _DECADES, 0.0, 1.0)
 
 
 def _add_bound_columns(rows: list[Row], submission: Submission, split: Split) -> None:
-    """Add columns of points-2: errors divided by their medians at the Cramer-Rao bound."""
+    """Add the columns of points-2: errors divided by their medians at the Cramer-Rao bound."""
     numbers = [int(truth.name[1:]) for truth in split.truths]
     bounds = bound_medians(split.draws, split.seed, max(numbers) + 1, "links")
     at_R, at_T = (bounds[key][numbers] for key in ("e_R_deg", "e_T_deg"))
@@ -486,7 +488,7 @@ def _add_bound_columns(rows: list[Row], submission: Submission, split: Split) ->
 
 
 def add_area_columns(rows: list[Row], submission: Submission, split: Split) -> None:
-    """Add columns of pose-2: separate areas under the curves of rotation and direction."""
+    """Add the columns of pose-2: separate areas under the curves of rotation and direction."""
     for row, truth in zip(rows, split.truths, strict=True):
         R = max(0.0, 1.0 - row["e_R_deg"] / _AREAS_DEG[0])
         T = R if math.isnan(row["e_T_deg"]) else max(0.0, 1.0 - row["e_T_deg"] / _AREAS_DEG[1])
@@ -494,7 +496,7 @@ def add_area_columns(rows: list[Row], submission: Submission, split: Split) -> N
 
 
 def _add_match_columns(rows: list[Row], submission: Submission, split: Split) -> None:
-    """Add columns of pose-own: number of the method's own matches, and share of correct ones."""
+    """Add the columns of pose-own: number of the method's own matches, and share of correct ones."""
     own = read_own_matches(submission.folder, split.by_name)
     for row, truth in zip(rows, split.truths, strict=True):
         row |= match_scores(truth.rendered, None if own is None else own[truth.name])
@@ -504,7 +506,7 @@ def _add_match_columns(rows: list[Row], submission: Submission, split: Split) ->
 
 
 class OwnMatchesTrack(MotionTrack):
-    """Motions from rendered frames; a method's own matches may be submitted."""
+    """A track of motions from rendered frames; a method may submit its own matches."""
 
     own_matches = True
     also_uses = ("images",)
@@ -517,7 +519,7 @@ class OwnMatchesTrack(MotionTrack):
             images, scanning = read_frames(inputs, problem), problem.shutter.scanning
             try:
                 matches = find_matches_of_rig(images, problem.rig, scanning, options)
-            except RsbenchError:  # frames without texture: every solver fails, with this reason
+            except RsbenchError:  # frames without texture: every solver fails, because it has no matches
                 matches = problem.correspondences
             found.append(replace(problem, correspondences=matches))
             step(problem.name)
@@ -542,10 +544,10 @@ class OwnMatchesTrack(MotionTrack):
 
 
 def match_files(beside: Path) -> list[str]:
-    """Names of the files of matches beside a file of answers.
+    """Return the names of the files of matches beside a file of answers.
 
     Raises:
-        RsbenchError: the folder ``matches`` contains something else, or is a link.
+        RsbenchError: ``matches`` contains other files, is empty, or is no folder but a file or link.
     """
     folder = beside / MATCHES
     if not os.path.lexists(folder):
@@ -564,8 +566,8 @@ def read_own_matches(beside: Path, problems: Mapping[str, Truth]) -> dict[str, C
     """Read a method's own matches, by the name of the problem; None if there is no folder of matches.
 
     Raises:
-        RsbenchError: see ``match_files``; a file is no such table, names an unknown problem, or has more matches
-            of a problem than its images have pixels.
+        RsbenchError: a file is not such a table, names an unknown problem, or has more matches of a problem than
+            its images have pixels; see also ``match_files``.
     """
     names = match_files(beside)
     tables = {name.removesuffix(".csv"): _table(beside / MATCHES / name, problems) for name in names}
@@ -616,9 +618,9 @@ def match_scores(sequence: Rendered, matches: Correspondences | None) -> dict[st
 
 
 def match_errors(sequence: Rendered, views: tuple[View, View], rows: FloatArray) -> FloatArray:
-    """Return distances (n,), px, of the second points of matches (n, 4) from the true ones; infinite without one.
+    """Return distances (n,), px, of the second pixels of matches (n, 4) from the true ones; infinite without one.
 
-    A pixel that shows no surface is at infinity.
+    A pixel without a surface shows a point at infinity.
     """
     source, target = views
     disparity = np.nan_to_num(sequence.rig.disparity(sequence.depth("rs", *source))).astype(np.float32)
@@ -630,7 +632,7 @@ def match_errors(sequence: Rendered, views: tuple[View, View], rows: FloatArray)
     return np.where(np.isfinite(error) & np.isfinite(there), error, np.inf)
 
 
-# The track of motions from frames alone: a method finds its own matches, and may submit them.
+# Fields of the tracks
 
 
 _SHOWN_TOO = tuple(

@@ -1,11 +1,11 @@
 """Tracks whose answers are pictures: depth maps or corrected frames beside the file of answers.
 
-A job of running cards is one problem for all cards without a current answer: matchers share the motion, correctors
-share motion and depth. The seconds of an entry are those that it would take without the others.
+A job runs all cards without a current answer on one problem: matchers share the motion, correctors share motion
+and depth. The run time of an entry is the time that it would take alone.
 
-Pictures are also scored problem by problem, in one process of one thread each, because all entries share
-intermediate results of the truth. A score depends neither on the process nor on other entries: nothing is random,
-and the order of sums is fixed.
+Pictures are scored problem by problem in single-threaded processes, because all entries share intermediate results
+of the truth. A score depends neither on the process nor on other entries: nothing is random, and the order of sums
+is fixed.
 """
 
 from __future__ import annotations
@@ -61,26 +61,26 @@ Draw = Callable[[TruePictures, Path], None]
 
 
 class CardChain(NamedTuple):
-    """The chain in which a card runs: a matcher, or a corrector with the default solver and matcher."""
+    """The pipeline that runs a card: a matcher, or a corrector with the default solver and matcher."""
 
     options: CorrectionOptions
     entry: Entry[Any, Any]
-    """Name of the component of the card."""
+    """The loaded component of the card."""
     key: object
-    """Everything that determines an answer."""
+    """All data that determine its answers, apart from the inputs."""
     uses: tuple[str, ...]
-    """Names of ``KNOWLEDGE``."""
+    """Inputs that it uses, names of ``KNOWLEDGE``."""
     reference: str = ""
     """Where the method is published."""
 
     def choosing(self) -> CardChain:
-        """The same chain with the motion model chosen by the matches, as in ``rsbench correct``."""
+        """Return the same chain, which selects the motion model by the matches, as ``rsbench correct`` does."""
         options = replace(self.options, motion_model=AUTO)
         return self._replace(options=options, key=options.key)
 
 
 class SharedWork:
-    """A problem whose pictures are made, and the results that several entries share."""
+    """A problem whose pictures are made, and the intermediate results that entries share."""
 
     def __init__(self, problem: Problem, images: Images, requested: tuple[RequestedPicture, ...]) -> None:
         self.problem, self.images, self.requested = problem, images, requested
@@ -89,7 +89,7 @@ class SharedWork:
         self.left: Given | None = None
         """Estimates from the frames of the left camera only; None: not estimated yet."""
         self.spent: dict[str, float] = {}
-        """Seconds by step."""
+        """Run time of each step, seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,9 +108,9 @@ class PictureTrack(Track):
     answers = PictureAnswer
     pictures = True
     part_score: ClassVar[str]
-    """Prefix of the columns of scores of parts of the pixels, see ``pictures.PARTINGS``."""
+    """Prefix of the columns with scores of parts of the pixels, see ``pictures.PARTINGS``."""
     part_title: ClassVar[str]
-    """Their name in figures."""
+    """Title of these scores in figures."""
 
     # Methods of each kind of picture
 
@@ -120,27 +120,27 @@ class PictureTrack(Track):
 
     @abstractmethod
     def hints(self, drawn: Any, pictures: TruePictures, public: bool) -> Iterable[str]:
-        """Likely mistakes in the result of ``read``; it is compared with the truth if that is public."""
+        """Return likely mistakes in the result of ``read``, which is compared with the truth if it is public."""
 
     @abstractmethod
     def truth_of(self, pictures: TruePictures) -> Any:
-        """The part of the truth of a problem that ``scores_of`` needs."""
+        """Return the part of the truth of a problem that ``scores_of`` needs."""
 
     @abstractmethod
     def scores_of(self, true: Any, drawn: Any | None) -> Numbers:
-        """Scores of the result of ``read`` (None: a failure) by that of ``truth_of``."""
+        """Score the result of ``read`` (None: a failure) against the result of ``truth_of``."""
 
     @abstractmethod
     def draw(self, pictures: TruePictures, place: Path) -> None:
-        """Write pictures for a template."""
+        """Write example pictures for a template."""
 
     @abstractmethod
     def chain(self, card: str) -> CardChain:
-        """The chain of a card. Raises RsbenchError: no such card."""
+        """Return the chain of a card; RsbenchError if the card does not exist."""
 
     @abstractmethod
     def make(self, work: SharedWork, chain: CorrectionOptions, place: Path) -> dict[str, Any]:
-        """Write the pictures of a chain into a new folder; returns the answer without its name."""
+        """Run a chain and write its pictures into a new folder; returns the answer without its name."""
 
     # Predictions
 
@@ -226,7 +226,7 @@ class PictureTrack(Track):
 def _rows_of(
     submissions: Sequence[Submission], split: Split, workers: Workers, names: list[str]
 ) -> Generator[tuple[str, list[Row | str]], None, None]:
-    """``picture_rows`` of problems by their names, as they become ready; with one worker, in this process."""
+    """Yield the name and ``picture_rows`` of each finished problem; one worker runs in this process."""
     if workers == 1:
         yield from ((name, picture_rows(split, name, submissions)) for name in names)
         return
@@ -243,7 +243,7 @@ def _serve_rows(submissions: Sequence[Submission], split: Split) -> Callable[[st
 
 
 def picture_rows(split: Split, name: str, submissions: Sequence[Submission]) -> list[Row | str]:
-    """Scores of the pictures of each submission, which are read here, or the fault in them.
+    """Read and score the pictures of a problem; returns, for each submission, the scores or the fault in it.
 
     Raises:
         RsbenchError: the truth has changed since the split was read.
@@ -265,7 +265,7 @@ def picture_rows(split: Split, name: str, submissions: Sequence[Submission]) -> 
 
 
 def _strange_files(folder: Path, split: Split, answered: Collection[str]) -> Iterator[str]:
-    """A line for each file below ``pictures`` that is no picture of an answer."""
+    """Yield a message for each file below ``pictures`` that does not belong to an answer."""
     if folder.is_symlink() or not folder.is_dir():
         return
     for place in sorted(folder.iterdir()):
@@ -285,7 +285,7 @@ def _strange_files(folder: Path, split: Split, answered: Collection[str]) -> Ite
 
 
 def drawn_oracle(name: str, uses: str, description: str, draw: Draw) -> tuple[str, Callable[[Split, Path], str]]:
-    """An entry of ``Track.oracles`` whose pictures a function draws."""
+    """Return an entry of ``Track.oracles`` whose pictures are written by the function ``draw``."""
     return name, partial(_drawn_answers, name, uses, description, draw)
 
 

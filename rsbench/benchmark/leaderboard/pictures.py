@@ -1,6 +1,6 @@
-"""Pictures of a submission: which are requested, their ground truth, and safe reading.
+"""Pictures of a submission: which ones are requested, their ground truth, and safe reading of untrusted files.
 
-They show frame 1 of the left camera, so that a method can use the frame before. They are stored next to the file
+They show frame 1 of the left camera, so that a method can use the previous frame. They are stored next to the file
 of answers as ``pictures/PROBLEM/NAME.png``. File names are never taken from a submission, and links are not
 followed. The size of an image is read from its header before decoding.
 """
@@ -44,24 +44,24 @@ class RequestedPicture(NamedTuple):
     stem: str
     """Name of its file without suffix, such as ``left_1_middle``."""
     row: int
-    """Row whose time it shows, in order of readout; 0 for depth, where each pixel has the time of its own row."""
+    """Row to whose time it is corrected, in order of readout; 0 for depth, where each row has its own time."""
     file: str
     """Path of the true picture below the folder of the sequence."""
     suffixes: tuple[str, ...] = (".png",)
-    """Suffixes of the file formats that it may have."""
+    """Allowed suffixes of its file."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TruePictures:
-    """The sequence of a problem, whose files are covered by the fingerprint of the split."""
+    """True pictures of a problem, from its sequence; the fingerprint of the split covers its files."""
 
     sequence: Sequence
     requested: tuple[RequestedPicture, ...]
     files: Mapping[str, str]
-    """SHA-256 by path below the sequence's folder, for the inputs of methods and the ground truth."""
+    """SHA-256 of the inputs of methods and of the ground truth, by path relative to the sequence's folder."""
 
     def check(self) -> None:
-        """Raises RsbenchError if a file is not the one of the split."""
+        """Raise RsbenchError if a file differs from that of the split."""
         for name, digest in self.files.items():
             path = inside(self.sequence.folder, name)
             if not path.is_file() or sha256(path) != digest:
@@ -74,28 +74,28 @@ class TruePictures:
         return camera.width, camera.height
 
     def path(self, each: RequestedPicture) -> Path:
-        """File of the true picture."""
+        """Return the file of the true picture."""
         return inside(self.sequence.folder, each.file)
 
     def depth(self) -> NDArray[np.float32]:
-        """(H, W) true depth, m, 0 where there is no surface."""
+        """Return the true depth (H, W), metres, 0 where there is no surface."""
         return self.sequence.depth("rs", *VIEW)
 
     def frame(self, row: int) -> NDArray[np.uint8]:
-        """(H, W, 3) global-shutter image at the pose of a requested row."""
+        """Return the global-shutter image (H, W, 3) at the pose of a requested row."""
         (file,) = (each.file for each in self.requested if each.row == row)
         return read_png(inside(self.sequence.folder, file), self.size)
 
     def rolling(self) -> NDArray[np.uint8]:
-        """(H, W, 3) the rolling-shutter frame."""
+        """Return the rolling-shutter frame (H, W, 3)."""
         return self.sequence.image("rs", *VIEW)
 
     def seen_by_both(self, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(H, W) pixels of the frame, with true ``depth`` (H, W), whose point is visible in the right camera."""
+        """Return the mask (H, W) of pixels whose scene point, by true ``depth`` (H, W), the right camera sees."""
         return seen_by_other(depth, self.sequence.depth("rs", "right", 1), self.sequence.rig, "left")
 
     def commons(self) -> list[NDArray[np.bool_]]:
-        """(H, W) pixels of each corrected frame whose scene point the rolling-shutter frame shows."""
+        """Return a mask (H, W) for each corrected frame: pixels whose scene point the original frame shows."""
         images = {view: self.sequence.image("rs", *view) for view in VIEWS}
         pairs = true_pairs(self.sequence, images)
         return [visible_pixels(self.sequence, pairs, (VIEW,), each.row)[VIEW] for each in self.requested]
@@ -110,20 +110,20 @@ FARTHEST = 1e9
 _FILE = re.compile(
     rf"pictures/{NAME.pattern}/left_1(_first|_middle|_last)?\.(exr|png)|matches/(left|right|stereo_[01]|tracks)\.csv"
 )
-"""Paths of pictures and matches below an entry: nothing else is copied from other boards."""
+"""Paths of pictures and matches relative to an entry; other files are not copied."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _COLOURS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 """Colour types of a PNG header."""
 _BYTES_OF_PIXEL = 16
 _BYTES = 1 << 16
-"""Largest size of a file: this many bytes, plus ``_BYTES_OF_PIXEL`` for each pixel."""
+"""Limit of the size of a file: this number of bytes plus ``_BYTES_OF_PIXEL`` for each pixel."""
 
 
 def find_picture(folder: Path, problem: str, picture: RequestedPicture) -> Path:
-    """The file of a picture below ``pictures``.
+    """Find the file of a picture in the folder ``pictures``.
 
     Raises:
-        RsbenchError: there is none, there are two of different formats, or it is a link or no file.
+        RsbenchError: it is missing, there are two of different formats, or it is a link or no file.
     """
     paths = [folder / problem / f"{picture.stem}{suffix}" for suffix in picture.suffixes]
     found = [path for path in paths if os.path.lexists(path)]
@@ -139,12 +139,13 @@ def copy_files(folder: Path, names: Iterable[str], target: Path) -> dict[str, st
     """Copy the files beside a file of answers; returns the SHA-256 of each, by its name.
 
     Args:
-        folder: their folder.
-        names: such as ``pictures/castle/left_1.exr``.
-        target: a folder, created if missing.
+        folder: folder of the file of answers.
+        names: relative paths such as ``pictures/castle/left_1.exr``.
+        target: folder of the copies, created if missing.
 
     Raises:
-        RsbenchError: a name leads elsewhere, a file is missing, a link or too large, or cannot be written.
+        RsbenchError: a name is not that of a picture or of matches; a file is missing, a link or too large, or
+            cannot be written.
     """
     copied = {}
     for name in names:
@@ -156,7 +157,7 @@ def copy_files(folder: Path, names: Iterable[str], target: Path) -> dict[str, st
 
 
 def file_bytes(folder: Path, name: str) -> bytes:
-    """The content of a file such as ``pictures/castle/left_1.exr`` below a folder; errors as ``copy_files``."""
+    """Read a file such as ``pictures/castle/left_1.exr`` below a folder; errors are those of ``copy_files``."""
     if not _FILE.fullmatch(name):
         raise RsbenchError(f"{folder}: {name[:100]!r} is no name of a file of an answer")
     check_own(folder, name)
@@ -164,7 +165,7 @@ def file_bytes(folder: Path, name: str) -> bytes:
 
 
 def check_own(folder: Path, name: str) -> None:
-    """Raises RsbenchError unless a file and all folders that lead to it exist and are no links."""
+    """Raise RsbenchError unless a file and the folders on the path to it exist and are not links."""
     path = folder
     *folders, file = name.split("/")
     for part, kind, is_kind in (
@@ -177,15 +178,15 @@ def check_own(folder: Path, name: str) -> None:
 
 
 def read_answer_depth(folder: Path, pictures: TruePictures, png_unit_m: float | None) -> NDArray[np.float32]:
-    """Depth (H, W), m, 0 where unknown, of an answer: an EXR file or a PNG of 16 bits.
+    """Read the depth map (H, W) of an answer, metres, 0 where unknown, from an EXR file or a PNG of 16 bits.
 
     Args:
-        folder: ``pictures`` beside the file of answers.
-        pictures: of the problem.
+        folder: folder ``pictures`` beside the file of answers.
+        pictures: true pictures of the problem.
         png_unit_m: depth in metres of one grey level of a PNG.
 
     Raises:
-        RsbenchError: as ``find_picture``; the file has another format, or values that are no depth.
+        RsbenchError: the file has another format or invalid values of depth; see also ``find_picture``.
     """
     (picture,) = pictures.requested
     path, size = find_picture(folder, pictures.sequence.name, picture), pictures.size
@@ -210,11 +211,11 @@ def read_answer_depth(folder: Path, pictures: TruePictures, png_unit_m: float | 
 def read_answer_frame(
     folder: Path, pictures: TruePictures, picture: RequestedPicture
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """A frame (H, W, 3) RGB of an answer, black where nothing was drawn, and the mask (H, W) where alpha is above
-    0.
+    """Read a frame (H, W, 3) of an answer, RGB, and the mask (H, W) of drawn pixels, whose alpha is above 0; other
+    pixels are black.
 
     Raises:
-        RsbenchError: as ``find_picture``; the file is no colour PNG of 8 bits of the camera's size.
+        RsbenchError: the file is no colour PNG of 8 bits and of the camera's size; see also ``find_picture``.
     """
     pixels = _read_png(find_picture(folder, pictures.sequence.name, picture), pictures.size, 8, ("RGB", "RGBA"))
     if pixels.shape[2] == 3:
@@ -224,7 +225,7 @@ def read_answer_frame(
 
 
 def frame_png(image: NDArray[np.uint8], drawn: NDArray[np.bool_]) -> bytes:
-    """Content of a file that ``read_answer_frame`` reads, without alpha if all pixels were drawn."""
+    """Encode a frame as PNG for ``read_answer_frame``, without alpha if all pixels are drawn."""
     alpha = [] if np.all(drawn) else [np.where(drawn, np.uint8(255), np.uint8(0))]
     ok, data = cv2.imencode(".png", np.dstack([image[..., ::-1], *alpha]))
     if not ok:
@@ -233,7 +234,7 @@ def frame_png(image: NDArray[np.uint8], drawn: NDArray[np.bool_]) -> bytes:
 
 
 def _check_bytes(path: Path, size: tuple[int, int]) -> bytes:
-    """The content of a file, if it is no larger than a picture of this size can be."""
+    """Read a file; RsbenchError if it is larger than a picture of this size can be."""
     return read_bytes(path, _BYTES + _BYTES_OF_PIXEL * size[0] * size[1])
 
 

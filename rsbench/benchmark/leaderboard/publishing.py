@@ -1,8 +1,8 @@
 """Secret test splits of rendered frames: public inputs, a commitment, and the truth from the secret text.
 
 A hash of the text, the fingerprint of the split, and a hash of all files of the keeper's dataset are announced.
-Whoever gets the text afterwards can verify that it is the announced one, that it gives the same motions, and, by
-rendering again, the same frames and depth.
+When the text is published afterwards, anyone can verify that it is the announced one, that it gives the same
+motions, and, by rendering again, the same frames and depth.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Announcement:
-    """The information on a secret split that is published before anybody submits."""
+    """The properties of a secret split that are published before anybody submits."""
 
     format: int
     card: str
@@ -55,16 +55,16 @@ class Announcement:
 
 
 def secret_of(track: Track, text: Secret) -> Secret:
-    """Text from which a split is drawn. A track of the readout ratio has its own split, because the inputs of
-    other tracks reveal the ratio."""
+    """Return the text from which the split of a track is drawn. A track of the readout ratio has its own split,
+    because the inputs of other tracks reveal the ratio."""
     return text if track.gives_readout else Secret(text.digest("track", track.name).hex())
 
 
 def drawn_split(track: Track, card: str, text: Secret) -> Split:
-    """The split that ``publish`` makes, from the text only, without rendering.
+    """Return the split that ``publish`` makes, from the text only, without rendering.
 
     Raises:
-        RsbenchError: as ``secret_card``; or the truth of the track must be rendered.
+        RsbenchError: the truth of the track must be rendered; see also ``secret_card``.
     """
     if track.pictures or track.inputs.whole:
         raise RsbenchError(f"track {track.name!r}: its truth is rendered; name the keeper's folder with --keep")
@@ -74,7 +74,7 @@ def drawn_split(track: Track, card: str, text: Secret) -> Split:
 
 
 def _sequences(card: DatasetCard) -> list[Sequence]:
-    """The sequences of a card, as read after rendering."""
+    """Return the sequences of a card as if they were read after rendering."""
     names = {each.scene for each in card.sequence}
     scenes = {name: read_scene_card(card_path("scenes", name))[0].name for name in names}
     manifests = [card.manifest_of(each) | {"scene": {"name": scenes[each.scene]}} for each in card.sequence]
@@ -93,8 +93,8 @@ def publish(
 ) -> Announcement:
     """Render a secret split into the keeper's folder, and write its inputs and the announcement into another one.
 
-    If ``out`` already has an announcement, the result must equal the announced one to the last byte: that is the
-    proof.
+    If ``out`` already has an announcement, all files must equal the announced ones to the last byte, which proves
+    that the published split is the announced one.
 
     Args:
         track: a track of frames.
@@ -107,7 +107,8 @@ def publish(
         progress: as for ``generate_dataset``.
 
     Raises:
-        RsbenchError: the card hides nothing; a folder contains something else; another split was announced.
+        RsbenchError: the card cannot make a secret split; a folder contains something else; another split was
+            announced.
     """
     secret, data = secret_of(track, text), keep / DATA
     drawn = secret_card(card, secret, keep / SCENES)
@@ -133,7 +134,7 @@ def publish(
 
 
 def _announcement(split: Split, card: str, text: Secret, data: Path) -> Announcement:
-    """The announcement without the public files."""
+    """Return the announcement, without the hashes of the public files."""
     first, path = read_dataset_manifest(data).sequences[0], card_path("datasets", card)
     return Announcement(
         format=FORMAT,
@@ -149,7 +150,7 @@ def _announcement(split: Split, card: str, text: Secret, data: Path) -> Announce
 
 
 def truth_hash(data: Path) -> str:
-    """SHA-256 of the names and hashes of all files of a dataset, independent of its folder."""
+    """Return the SHA-256 of the names and hashes of all files of a dataset; it does not depend on the folder."""
     listed = {name: file.sha256 for name, file in read_dataset_manifest(data).files.items()}
     return hashlib.sha256(json.dumps(listed, sort_keys=True).encode()).hexdigest()
 
@@ -158,7 +159,7 @@ def read_announcement(folder: Path) -> Announcement:
     """Read the announcement in a public folder.
 
     Raises:
-        RsbenchError: it is missing, or damaged.
+        RsbenchError: it is missing or damaged.
     """
     path = folder / ANNOUNCEMENT
     if not path.is_file():
@@ -172,7 +173,7 @@ def read_announcement(folder: Path) -> Announcement:
 
 
 def announced_split(announced: Announcement, track: Track, card: str, text: Secret, keep: Path | None) -> Split:
-    """The truth of an announced split, drawn again or from the keeper's folder.
+    """Return the announced split with its truth, drawn again from the text or read from the folder ``keep``.
 
     Raises:
         RsbenchError: the text, the split or the keeper's files differ from the announced ones.
@@ -188,7 +189,7 @@ def announced_split(announced: Announcement, track: Track, card: str, text: Secr
 
 
 def _check_same(announced: Announcement, found: Announcement, *names: str) -> None:
-    """Raises RsbenchError if a value differs from the announced one."""
+    """Raise RsbenchError if one of the named values differs from the announced one."""
     for name in names:
         if getattr(announced, name) != getattr(found, name):
             raise RsbenchError(

@@ -43,9 +43,9 @@ AUC_READOUT = {"auc_r10": 0.1, "auc_r02": 0.02}
 """Thresholds of the areas under the curve of the error, by the name of the column."""
 CONSTANT = "constant"
 RIGHT = 0.1
-"""Largest error of a readout ratio that counts as right."""
+"""Largest error of a correct readout ratio."""
 _MAX_SIGMA = 0.2
-"""Largest standard deviation of a ratio with which rsbench's entries answer."""
+"""Largest standard deviation of a ratio that rsbench's entries submit; with a larger one they fail."""
 _WORST = 1.0
 """Error of a failure: the largest possible error of a ratio."""
 _READOUT = (
@@ -80,7 +80,7 @@ class ReadoutTrack(SolverTrack):
     """The readout ratio, from given matches of rendered frames."""
 
     states_sigma: bool = False
-    """Whether rsbench's entries state the deviation of their ratio."""
+    """Whether answers of rsbench's entries have the standard deviation of the ratio."""
     answers = _Readout
 
     def true_answer(self, truth: Truth) -> Mapping[str, Any]:

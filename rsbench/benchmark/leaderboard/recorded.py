@@ -1,8 +1,8 @@
-"""Points on recorded trajectories: matches under motion that no solver's model describes.
+"""Simulated points under recorded trajectories, which no solver's motion model describes exactly.
 
-A recording is a file of poses of a camera in TUM's format, whose name begins with the kind of its device, as in
-``hand-rig.txt``. Those in cards/recordings come with rsbench; its README has their sources, licences and errors. A
-problem is a window of two frames of a recording, whose rows follow the spline through the poses; rig, depths,
+A recording is a file of camera poses in TUM's format, whose name begins with the type of its device, as in
+``hand-rig.txt``. rsbench comes with those in cards/recordings; the README there has sources, licences and errors.
+A problem is a window of two frames of a recording, with row poses on the spline through its poses; rig, depths,
 noise, outliers and number of points are drawn as in points-2.
 """
 
@@ -26,9 +26,9 @@ from rsbench.core.spline_motion import TrajectoryMotion
 from rsbench.dataset.motion_cards import Trajectory, poses_around, read_trajectory
 
 DEVICES: dict[str, RigKind] = {"hand": KINDS["headset"], "car": KINDS["car"], "drone": KINDS["drone"]}
-"""Sizes of the rig of each kind of device; its motion is that of the recording."""
+"""Type of rig of each type of device, for its sizes only: the motion is that of the recording."""
 OF_A_RECORDING = 60
-"""Problems of each recording."""
+"""Number of problems of each recording."""
 _SCOPE = ("leaderboard", "points-recorded")
 _PERIOD_S = 1.0 / 30.0
 _LASTS = 2.0
@@ -37,16 +37,16 @@ _READOUT = (0.5, 1.0)
 
 
 def recordings_folder() -> Path:
-    """The recordings that come with rsbench."""
+    """Return the folder of the recordings that come with rsbench."""
     return shipped_folder("cards/recordings", "_cards/recordings")
 
 
-@lru_cache(maxsize=8)  # one object for a folder: problems and bounds are kept by it
+@lru_cache(maxsize=8)  # the same object for a folder, because it is a key of other caches
 def recorded_draws(folder: Path) -> Draws:
-    """The problems of the recordings in a folder.
+    """Return the generator of the problems of the recordings in a folder.
 
     Raises:
-        RsbenchError: there are none, or a name begins with no kind of device.
+        RsbenchError: there are no recordings, or a name does not begin with a type of device.
     """
     names = recordings_in(folder)
     return Draws(
@@ -61,7 +61,7 @@ def recorded_draws(folder: Path) -> Draws:
 
 @lru_cache(maxsize=8)
 def recordings_in(folder: Path) -> tuple[str, ...]:
-    """Names of the recordings in a folder, sorted; raises as ``recorded_draws``."""
+    """Return the names of the recordings in a folder, sorted; errors are those of ``recorded_draws``."""
     names = tuple(sorted(path.stem for path in folder.glob("*.txt")))
     if not names:
         raise RsbenchError(
@@ -87,7 +87,7 @@ def _order(folder: Path, seed: int) -> NDArray[Any]:
 
 
 def _window(folder: Path, seed: int, number: int) -> tuple[str, int]:
-    """Name of the recording of a problem, and index of the part of it that contains the window."""
+    """Return the name of the recording of a problem, and the index of the part that contains its window."""
     names = recordings_in(folder)
     part, which = divmod(int(_order(folder, seed)[number]), len(names))
     return names[which], part
@@ -95,7 +95,7 @@ def _window(folder: Path, seed: int, number: int) -> tuple[str, int]:
 
 @lru_cache(maxsize=512)
 def _motion(folder: Path, seed: int, number: int) -> Motion:
-    """A window at a random time within its part of the recording.
+    """Return the motion of a problem, in a window at a random time within its part of the recording.
 
     Raises:
         RsbenchError: the recording is shorter than a window.
@@ -114,7 +114,7 @@ def _motion(folder: Path, seed: int, number: int) -> Motion:
 
 @lru_cache(maxsize=512)
 def _setting(folder: Path, seed: int, number: int) -> Setting:
-    """Setting of a problem with the sizes of w and d of the window; the motion itself is not made from it."""
+    """Return the setting of a problem, with the sizes of w and d of its motion, which is not made from it."""
     kind = DEVICES[_window(folder, seed, number)[0].partition("-")[0]]
     motion, rng = _motion(folder, seed, number), generator(seed, *_SCOPE, "setting", number)
     return Setting(
@@ -133,7 +133,7 @@ def _kinds(folder: Path, seed: int, number: int) -> dict[str, float | str]:
 
 
 class RecordedPoints(DrawnPoints):
-    """Points on the recordings of a folder (``--data``), or on those that come with rsbench."""
+    """Inputs of points under the recordings of a folder (``--data``), or under those that come with rsbench."""
 
     def draws_of(self, data: Path | None) -> Draws:
         folder = data or recordings_folder()

@@ -1,9 +1,9 @@
-"""Tracks of real rigs: any two cameras, with the true calibration and with a loose one.
+"""Tracks of real rigs: any two cameras, with the true calibration and with an inaccurate ("loose") one.
 
 Each sequence gives two problems with the same frames. In one the given calibration is the true one. In the other
-the right camera is rotated, and focal lengths and principal points of both cameras have errors, each of a fixed
-size in a direction that is drawn by the name. The truth is the motion of the left camera in its own axes, which do
-not depend on the calibration.
+the right camera is rotated, and focal lengths and principal points of both cameras have errors. Their sizes are
+fixed; their signs and directions are random, with a seed from the sequence's name. The truth is the motion of the
+left camera in its own axes, which do not depend on the calibration.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from rsbench.dataset.sequence import Sequence as Rendered
 from rsbench.dataset.sequence import read_pairs
 
 LOOSE = "-loose"
-"""Suffix of the name of a problem whose given calibration is not the true one."""
+"""Suffix of the name of a problem whose given calibration is the loose one."""
 TURN_DEG = 0.2
-"""Angle by which a loose calibration rotates the right camera about a drawn axis; its position is right."""
+"""Angle by which a loose calibration rotates the right camera about a random axis; its position is correct."""
 FOCAL = 0.005
 """Relative error of the focal length of each camera."""
 CENTRE_PX = 0.5
-"""Distance of the principal point of each camera from the true one, in a drawn direction."""
+"""Distance of the principal point of each camera from the true one, in a random direction."""
 
 
 def loose_rig(rig: StereoRig, rng: np.random.Generator) -> StereoRig:
-    """The rig of a loose calibration; the positions of both cameras in the left one's axes are right."""
+    """Return the rig of a loose calibration; the positions of both cameras in the left one's axes are correct."""
     left, right = (_loose_camera(rig.sensor(side), rng) for side in SIDES)
     R, t = rig.right_from_left
     axis = rng.standard_normal(3)
@@ -55,7 +55,7 @@ def _loose_camera(camera: PinholeCamera, rng: np.random.Generator) -> PinholeCam
 
 @dataclass(frozen=True)
 class RigFrames(Frames):
-    """Pairs of frames of the sequences of a dataset, with the true calibration and with a loose one."""
+    """Inputs of the frame pairs of a dataset, each with the true calibration and with a loose one."""
 
     any_rig: bool = True
 
@@ -69,13 +69,13 @@ class RigFrames(Frames):
         return [each for both in zip(pairs, loose, strict=True) for each in both]
 
     def pairs(self, track: Track, folder: Path) -> list[Rendered]:
-        """Pairs of frames; if pictures of the left camera are scored, only of rigs with a rolling left camera."""
+        """Return the frame pairs; on tracks of pictures, only those whose left camera has a rolling shutter."""
         found = read_pairs(folder)
         return [each for each in found if each.shutter.ratio_of("left") > 0.0] if track.pictures else found
 
 
 def loose_of(name: str, rig: StereoRig) -> StereoRig:
-    """The loose calibration of a sequence of this name."""
+    """Return the loose calibration of the sequence with this name."""
     return loose_rig(rig, generator(0, "leaderboard", "loose calibration", name))
 
 
@@ -112,7 +112,7 @@ def left_camera_motion(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RigMotionTrack(MotionTrack):
-    """The motion of a rig of any two cameras, scored as that of its left camera in that camera's axes."""
+    """A track of motions of rigs of any two cameras, scored as the left camera's motion in its own axes."""
 
     def true_answer(self, truth: Truth) -> Mapping[str, Any]:
         w, d = left_camera_motion(truth.motion.w, truth.motion.d, "body", truth.rig, truth.given_rig or truth.rig)

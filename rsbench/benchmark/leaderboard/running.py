@@ -30,10 +30,10 @@ from rsbench.storage.work_folder import remove
 
 
 def load_cards(track: Track, cards: Sequence[str]) -> dict[str, Runnable]:
-    """The components that a track can run, by card.
+    """Load the components of cards that a track can run; returns them by card.
 
     Raises:
-        RsbenchError: a card is wrong or does not fit the track, or two of them have one name.
+        RsbenchError: a card is invalid or does not fit the track, or two components have the same name.
     """
     names = dict[str, str]()
     found = track.load(cards)
@@ -48,7 +48,7 @@ def load_cards(track: Track, cards: Sequence[str]) -> dict[str, Runnable]:
 
 
 def count_steps(split: Split, cards: Sequence[str], limits: Limits) -> int:
-    """Number of progress reports of ``run_cards``."""
+    """Return the number of calls of ``step`` by ``run_cards``."""
     problems = len(split.truths)
     matching = problems if split.track.own_matches else 0
     return len(cards) * -(-problems // split.track.chunk(limits)) + matching
@@ -65,21 +65,21 @@ def run_cards(
     step: Step = lambda word: None,
     features: str | None = None,
 ) -> list[Path]:
-    """Run cards on exported inputs; returns for each a file of predictions in ``work``, ready to be submitted.
+    """Run cards on exported inputs; returns a file of predictions in ``work`` for each card, ready to submit.
 
     Args:
         split: the problems.
-        cards: their names or files.
-        inputs: of ``prepare_inputs``.
-        work: folder that keeps answers.
-        workers: processes; 0: this one, without limits, for rsbench's own components.
-        limits: of each problem.
-        step: called with the name of an entry, or of a problem, when a part is done.
-        features: on tracks without given matches, those that solvers get; None: ``sift-refined``.
+        cards: names or paths of the cards.
+        inputs: folder written by ``prepare_inputs``.
+        work: folder in which answers are stored.
+        workers: number of processes; 0 runs rsbench's own components in this process, without limits.
+        limits: time and memory per problem.
+        step: called with the name of an entry, or of a problem, when a part is finished.
+        features: feature matcher for solvers on tracks without given matches; None: ``sift-refined``.
 
     Raises:
-        RsbenchError: a card does not fit the track; processes died each time over the same problems: what is
-            done is kept.
+        RsbenchError: a card does not fit the track, or processes died repeatedly on the same problems; finished
+            answers are kept.
     """
     track = split.track
     runnables = load_cards(track, cards)
@@ -125,7 +125,7 @@ def run_cards(
 
 
 def _write(split: Split, runnable: Runnable, answers: Sequence[dict[str, Any]], folder: Path) -> Path:
-    """The answers of a card as one submission."""
+    """Write the answers of a card as a submission; returns the file."""
     about = dict(runnable.header)
     header = {
         **method_header(split, runnable.name, about.pop("uses"), about.pop("description")),
@@ -141,10 +141,12 @@ def _write(split: Split, runnable: Runnable, answers: Sequence[dict[str, Any]], 
 def _done(
     track: Track, jobs: Sequence[Job], workers: Workers, inputs: Path, limits: Limits, built_in: set[str]
 ) -> Iterator[Job]:
-    """Jobs as they are done in child processes of one thread; a job that exceeds its limits is a failure.
+    """Run jobs in single-threaded child processes, or in this one if ``workers`` is 0; yield each finished job.
+
+    With limits, a job that exceeds them or ends its process is stored as a failure.
 
     Raises:
-        RsbenchError: see ``finished_jobs``; only without limits.
+        RsbenchError: without limits, see ``finished_jobs``.
     """
     serve = partial(_serve, track)
     if workers == 0:
@@ -159,7 +161,7 @@ def _done(
         return
 
     def seconds_of(job: Job) -> float:
-        """Time limit of a job; components of other packages are limited in processes of their own."""
+        """Return the time limit of a job; components of other packages are limited in their own processes."""
         own = all(target.card in built_in for target in job.targets)
         return limits.seconds if limits.seconds is not None and own else math.inf
 
@@ -177,7 +179,7 @@ def _done(
 
 
 def _serve(track: Track, inputs: Path, limits: Limits) -> Any:
-    """Function that runs jobs in the child process."""
+    """Return the function that runs jobs in the child process."""
     use_one_thread()
     warm_up()
     solve = track.solver_of_jobs(inputs, limits)

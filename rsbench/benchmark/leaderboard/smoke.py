@@ -52,7 +52,7 @@ Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
 
 
 class Job(NamedTuple):
-    """Entries of a track that one process runs."""
+    """Entries of a track that one process runs one after the other."""
 
     track: str
     entries: tuple[str, ...]

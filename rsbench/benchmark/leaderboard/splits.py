@@ -42,7 +42,7 @@ FEATURES = "sift"
 _GYRO = "imu"
 """The channel with the samples of a gyroscope."""
 _AROUND = 1.0
-"""Frame periods before the first and after the last frame from which gyroscope samples are given."""
+"""Time, frame periods, before the first and after the last frame for which gyroscope samples are given."""
 FEWEST_FRAMES, MOST_FRAMES = 4, 250
 """Fewest and most frames of a whole sequence."""
 
@@ -144,7 +144,7 @@ KINDS = {
     "drone": RigKind(752, 480, 458.0, (0.06, 0.2), (2.0, 20.0), (0.2, 8.0), (0.02, 0.5), "drone"),
 }
 MODELS_DRAWN = ("linear", "twist", "inertial", "accelerated", "spline")
-"""Motion models; each is used for a fifth of the problems of each type of rig."""
+"""Motion models, each for a fifth of the problems of each type of rig."""
 _READOUT: Range = (0.1, 0.95)
 _CELLS = tuple((kind, model) for kind in KINDS for model in MODELS_DRAWN)
 _OF_A_CELL = 12
@@ -157,7 +157,7 @@ _SCOPE = ("leaderboard", "points-2")
 
 @lru_cache(maxsize=8)
 def _order(seed: int) -> NDArray[Any]:
-    """Return the index of the rig and motion model of each problem, shuffled so that names do not reveal it."""
+    """Return, for each problem, an index into ``_CELLS``, shuffled so that names of problems do not reveal it."""
     return generator(seed, *_SCOPE, "order").permutation(len(_CELLS) * _OF_A_CELL) % len(_CELLS)
 
 
@@ -289,11 +289,11 @@ def exact_problem(seed: int, number: int, draws: Draws = POINTS_1) -> tuple[Prob
     """Return a problem with noise-free inliers only, and the standard deviation of its noise, px.
 
     Raises:
-        RsbenchError: as ``simulated_problem``.
+        RsbenchError: see ``simulated_problem``.
     """
     setting = draws.setting(seed, number)
     found = _simulated(draws, setting.exact(), seed, number)
-    # Outliers are displaced after the noise is added, by the same draws; so the same matches are outliers here.
+    # Outliers are displaced after the noise is added, with the same random numbers, so they are the same matches.
     inliers = Correspondences(tracks=found.correspondences.tracks[~found.outliers["tracks"]])
     problem = Problem(name=_name(number), correspondences=inliers, rig=found.rig, known_shutter=found.shutter)
     return problem, setting.noise_px

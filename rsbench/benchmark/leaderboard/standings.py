@@ -1,11 +1,10 @@
 """Ranks of methods: confidence intervals of mean scores over scenes, ties, and ranks with intervals.
 
-Scores within a scene are not independent. The score of an entry is therefore the mean over scenes of its mean over
-the problems of a scene, and its interval is Student's, from the means of the scenes. Each simulated problem is a
-scene of its own. Two entries are compared by their differences on the same scenes; Holm's method (Scandinavian
-Journal of Statistics 1979) corrects for all pairs. The rank of an entry lies, with the same confidence for all
-entries at once, between the number of better entries and that of worse ones (Mogstad, Romano, Shaikh, Wilhelm,
-Review of Economic Studies 2024).
+Scores within a scene are not independent. The score of an entry is therefore the mean over scenes of the mean
+score in each scene, with Student's confidence interval from the scene means. Each simulated problem is a scene of
+its own. Two entries are compared by paired t tests on the same scenes; Holm's method (Scandinavian Journal of
+Statistics 1979) corrects for the number of pairs. The numbers of significantly better and worse entries give
+simultaneous confidence intervals of all ranks (Mogstad, Romano, Shaikh, Wilhelm, Review of Economic Studies 2024).
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _ROUNDING = 1e-12
 
 
 class Rank(NamedTuple):
-    """Rank, counted from 1, and the range of ranks that the data do not exclude."""
+    """A rank, counted from 1, and the ends of its confidence interval."""
 
     place: int
     low: int
@@ -40,19 +39,20 @@ class Rank(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Rank of an entry among those that use no more inputs; None if it is not ranked."""
+    """Rank of an entry among its peers, the entries whose inputs are a subset of its own."""
 
     rank: Rank | None = None
+    """None if the entry is not ranked."""
     peers: int = 0
-    """Number of these entries, itself included."""
+    """Number of peers, including the entry itself."""
     ties: tuple[str, ...] = ()
-    """Those of them that the data do not distinguish from it."""
+    """Names of the peers that do not differ significantly from it."""
 
 
 def better(means: FloatArray) -> NDArray[np.bool_]:
-    """(n, n) whether entry i is better than entry j, from means (n, k) of entries in scenes; higher is better.
+    """Return a mask (n, n), whether entry i is significantly better than entry j, from scene means (n, k).
 
-    All comparisons hold at once with ``statistics.COVERAGE``.
+    Higher means are better. The family-wise error of all comparisons is at most 1 - ``statistics.COVERAGE``.
     """
     i, j = np.triu_indices(len(means), 1)
     differences = means[i] - means[j]
@@ -64,7 +64,7 @@ def better(means: FloatArray) -> NDArray[np.bool_]:
 
 
 def _chances(differences: FloatArray) -> FloatArray:
-    """Two-sided p values (pairs,) of the paired t test of differences (pairs, k)."""
+    """Return the two-sided p values (pairs,) of paired t tests, from differences (pairs, k)."""
     k = differences.shape[1]
     middle = np.abs(np.mean(differences, axis=1))
     if k < 2:
@@ -74,7 +74,7 @@ def _chances(differences: FloatArray) -> FloatArray:
 
 
 def _holm(chances: FloatArray) -> NDArray[np.bool_]:
-    """(n,) whether a hypothesis with the p value (n,) is rejected at a family-wise error of 1 - COVERAGE."""
+    """Return the mask (n,) of rejected hypotheses, from p values (n,), at a family-wise error of 1 - COVERAGE."""
     order = np.argsort(chances, kind="stable")
     limits = (1.0 - COVERAGE) / (len(chances) - np.arange(len(chances)))
     fails = np.flatnonzero(chances[order] > limits)
@@ -84,12 +84,12 @@ def _holm(chances: FloatArray) -> NDArray[np.bool_]:
 
 
 def ranks(scores: FloatArray, beats: NDArray[np.bool_], uses: Sequence[frozenset[str]]) -> list[Rank]:
-    """Rank of each entry among those that use no more inputs.
+    """Return the rank of each entry among its peers, the entries whose inputs are a subset of its own.
 
     Args:
         scores: (n,) mean scores, higher is better.
-        beats: result of ``better``.
-        uses: the inputs of each entry.
+        beats: (n, n) result of ``better``.
+        uses: inputs of each entry.
     """
     found = []
     for i in range(len(scores)):
@@ -102,7 +102,7 @@ def ranks(scores: FloatArray, beats: NDArray[np.bool_], uses: Sequence[frozenset
 
 
 def ties(beats: NDArray[np.bool_], i: int) -> list[Any]:
-    """Entries that the data do not distinguish from entry i."""
+    """Return the indices of the entries that do not differ significantly from entry i."""
     return [j for j in range(len(beats)) if j != i and not beats[i, j] and not beats[j, i]]
 
 
@@ -115,42 +115,42 @@ class Standing:
 
     scored: Scored
     rank: Rank | None
-    """Rank among the entries that use no more inputs; None for oracles and entries in doubt."""
+    """Rank among the peers, the entries whose inputs are a subset of its own; None for oracles and entries in
+    doubt."""
     peers: int
-    """Number of these entries, itself included."""
+    """Number of peers, including the entry itself."""
     ties: tuple[str, ...]
-    """Those of them that the data do not distinguish from it."""
+    """Names of the peers that do not differ significantly from it."""
     means: dict[str, tuple[float, float, float]]
-    """For each share or mean of its protocol, the mean over scenes and the ends of its interval."""
+    """Mean over scenes and the ends of its confidence interval, for scores of the kinds share and mean."""
     medians: dict[str, float]
-    """For each other score, the median over problems; NaN where the entry has none."""
+    """Median over problems, for scores of the kind median; NaN if the entry has no values."""
     calibration: Calibration | None
-    """Calibration of the covariances that it states."""
+    """Calibration of its covariances; None without covariances."""
     log_rank: Rank | None
-    """Rank by the log score among the entries that have one and use no more inputs; None if it has no log
-    score."""
+    """Rank by the log score among the peers with covariances; None if the entry has none or is not ranked."""
     log_peers: int
-    """Number of these entries."""
+    """Number of peers with covariances."""
     parts: dict[str, tuple[float, float, float]]
-    """The primary score in each part of the problems, by the name of the part."""
+    """Primary score with its interval for each value of ``Track.parting``; empty without a parting."""
     worst: dict[str, tuple[str, float]]
-    """The problem with the largest error in each part, and that error; the key is "all" if there are no parts."""
+    """Problem with the largest error in each part, and that error; the key is "all" if there are no parts."""
 
     @property
     def track(self) -> Track:
-        """The track of its table."""
+        """The track of the entry."""
         return track_of_id(self.scored.header.protocol)
 
     @property
     def rank_words(self) -> str:
-        """Such as ``2 [1, 4] of 9``, ``alone``, ``oracle`` or ``in doubt``."""
+        """The rank as text, such as ``2 [1, 4] of 9``, ``alone``, ``oracle`` or ``in doubt``."""
         if self.rank is None:
             return "in doubt" if self.scored.doubt else "oracle"
         return _rank_words(self.rank, self.peers)
 
     @property
     def stated_words(self) -> dict[str, str]:
-        """Text by column: coverage of its 95 % ellipsoids, its log score, and its rank by that."""
+        """Table cells by column: coverage of the 95 % ellipsoids, log score, and rank by log score."""
         found = self.calibration
         words = {"in 95 %": format_interval(*found.covers[-1]) if found else "-"}
         if "log_score" in self.scored.scores:
@@ -160,7 +160,7 @@ class Standing:
 
     @property
     def assumes(self) -> str:
-        """The motion model that the method states; empty for an oracle."""
+        """The motion model that the method assumes, from its header; empty for an oracle."""
         return "" if ORACLE in self.scored.header.uses else self.scored.header.motion_model
 
     @property
@@ -170,7 +170,7 @@ class Standing:
 
     @property
     def uses(self) -> str:
-        """Its inputs, in the order of ``KNOWLEDGE``."""
+        """Names of its inputs, in the order of ``KNOWLEDGE``."""
         return " + ".join(name for name in KNOWLEDGE if name in self.scored.header.uses)
 
 
@@ -179,11 +179,11 @@ def _rank_words(rank: Rank, peers: int) -> str:
 
 
 def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None) -> list[Standing]:
-    """Rows of a table, sorted by the inputs (fewest first) and then by the score; oracles are last.
+    """Return the rows of a table, sorted by inputs (fewest first) and then by score; unranked entries are last.
 
     Args:
-        entries: of one split.
-        at_most: leave out entries that use other inputs.
+        entries: entries of one split.
+        at_most: names of inputs; entries that use others are left out.
 
     Raises:
         RsbenchError: the entries are not scored on the same problems.
@@ -198,7 +198,7 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
                 f"{each.folder}: is scored on other problems than {kept[0].folder.name}; rescore the board"
             )
     ranked = [each for each in kept if ORACLE not in each.header.uses and not each.doubt]
-    # Entries that state any covariance have a log score.
+    # The ranking by log score has only entries with covariances.
     stating = [each for each in ranked if "log_score" in each.scores and each.scores["nees"].notna().any()]
     scenes, primary = list(problems["scene"]), track_of_id(kept[0].header.protocol).primary
     places = _ranked(ranked, primary.key, primary.sign, scenes)
@@ -208,7 +208,7 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
 
 
 def _ranked(entries: Sequence[Scored], column: str, sign: float, scenes: Sequence[str]) -> dict[Scored, Place]:
-    """Ranks of entries by a column."""
+    """Rank entries by a column of their scores; ``sign`` is -1 if lower is better."""
     if not entries:
         return {}
     uses = [frozenset(each.header.uses) for each in entries]
@@ -269,13 +269,13 @@ def _parts(scores: pd.DataFrame, track: Track) -> dict[str, tuple[float, float, 
 
 
 def _median(values: FloatArray) -> float:
-    """Median of the values that are not NaN, infinite ones included."""
+    """Return the median of all values except NaN; infinite values count."""
     there = values[~np.isnan(values)]
     return float(np.median(there)) if there.size else float("nan")
 
 
 def table(lines: Sequence[Standing], worst: bool = True) -> pd.DataFrame:
-    """The numbers of a table, as in its CSV file; for a secret split without the ``worst`` problems."""
+    """Return a table as numbers, for its CSV file; ``worst`` adds the worst problems, unless a split is secret."""
     rows, unranked = list[dict[str, object]](), (None, None, None)
     for line in lines:
         header = line.scored.header

@@ -1,7 +1,7 @@
-"""Submitted predictions: JSON lines with a header and an answer for each problem; a fault is one line.
+"""Submitted predictions: JSON lines with a header and an answer for each problem; a fault is reported in a line.
 
-Nothing in the file is trusted: sizes are limited before decoding, names are looked up in the split and never used
-as paths, and numbers must be finite. The format is described in docs/how-to/submit.md.
+The file is not trusted: sizes are limited before decoding, names are looked up in the split and never used as
+paths, and numbers must be finite. docs/how-to/submit.md describes the format.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rsbench.storage.files import write_bytes
 from rsbench.storage.untrusted_files import MB, parse_json, read_text
 
 SUBMISSION_BYTES = 16 * MB
-"""Largest file of motions: 20 kB for each of 800 problems."""
+"""Limit of the size of a file: 20 kB for each of 800 problems."""
 _LINE_CHARACTERS = 1 << 16
 _MOST_FAULTS = 50
 _OF_SOLVE = (
@@ -39,7 +39,7 @@ class Findings:
     submission: Submission | None
     """None if there are faults."""
     faults: tuple[str, ...]
-    """One line each, with file, line, field, value and remedy."""
+    """Messages of one line, with file, line, field, value and remedy."""
     notes: tuple[str, ...]
     """Likely mistakes; they do not prevent scoring."""
 
@@ -48,7 +48,7 @@ def read_submission(path: Path, split: Split) -> Submission:
     """Read a file of predictions.
 
     Raises:
-        RsbenchError: the file has faults; the message has the first one and their number.
+        RsbenchError: the file has faults; the message has the first one, and the number of the others.
     """
     found = check_submission(path, split, hints=False)
     if found.submission is None:
@@ -59,7 +59,7 @@ def read_submission(path: Path, split: Split) -> Submission:
 
 
 def check_submission(path: Path, split: Split, *, hints: bool = True) -> Findings:
-    """All faults of a file of predictions and, with ``hints``, likely mistakes."""
+    """Check a file of predictions; return at most ``_MOST_FAULTS`` faults and, with ``hints``, likely mistakes."""
     faults: list[str] = []
     header: Header | None = None
     answers: dict[str, Answer] = {}
@@ -96,7 +96,7 @@ def check_submission(path: Path, split: Split, *, hints: bool = True) -> Finding
 
 
 def failure_reasons(path: Path) -> str:
-    """Number of failures in a file, and their reasons, the most frequent first; empty if there are none."""
+    """Return the number of failures in a file and their most frequent reasons as text; empty without failures."""
     answers = [parse_json(text, f"{path}:{number}") for number, text in _lines(path)][1:]
     reasons = Counter(str(each.get("reason", "")) for each in answers if each.get("success") is False)
     if not reasons:
@@ -108,10 +108,10 @@ def failure_reasons(path: Path) -> str:
 
 
 def protocol_of(path: Path) -> tuple[str, str]:
-    """The protocol named in the first line of a file, and the place ``file:line``.
+    """Return the protocol that the first line of a file names, and the place ``file:line``.
 
     Raises:
-        RsbenchError: the file cannot be read, or its first line names none.
+        RsbenchError: the file cannot be read, or its first line names no protocol.
     """
     number, text = next(_lines(path), (1, "{}"))
     data = parse_json(text, f"{path}:{number}")
@@ -125,7 +125,7 @@ def protocol_of(path: Path) -> tuple[str, str]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    if path.exists() and not path.is_file():  # a folder; or a pipe, which might never end
+    if path.exists() and not path.is_file():  # a folder, or a pipe, whose reading may never end
         raise RsbenchError(f"{path}: is no file: give the file of JSON lines")
     for number, line in enumerate(read_text(path, SUBMISSION_BYTES).split("\n"), start=1):
         if len(line) > _LINE_CHARACTERS:
@@ -192,12 +192,12 @@ def _few(names: list[str], total: int) -> str:
 
 
 def submission_text(header: Mapping[str, Any], answers: Iterable[Mapping[str, Any]]) -> str:
-    """JSON lines in the format of ``check_submission``."""
+    """Return the header and answers as JSON lines, in the format of ``check_submission``."""
     return "".join(json.dumps(line, allow_nan=False) + "\n" for line in (header, *answers))
 
 
 def method_header(split: Split, method: str, uses: Sequence[str], description: str) -> dict[str, Any]:
-    """The header of predictions by rsbench."""
+    """Return the header of predictions by rsbench."""
     return {
         "protocol": split.track.id,
         "split": split.name,
@@ -208,7 +208,7 @@ def method_header(split: Split, method: str, uses: Sequence[str], description: s
 
 
 def template_header(split: Split, method: str = "my-method") -> dict[str, Any]:
-    """All keys of a header, for users to fill in."""
+    """Return a header with all keys, for users to fill in."""
     return {
         "protocol": split.track.id,
         "split": split.name,
@@ -219,7 +219,7 @@ def template_header(split: Split, method: str = "my-method") -> dict[str, Any]:
 
 
 def write_template(split: Split, path: Path) -> None:
-    """Write a valid example: an answer to the first problem, and a failure for every other one."""
+    """Write a valid example file: an answer to the first problem, and a failure for every other one."""
     first, *rest = (truth.name for truth in split.truths)
     failures = [{"name": name, "success": False, "reason": "not tried"} for name in rest]
     split.track.draw_example(split, path.parent)
@@ -236,7 +236,7 @@ def write_truth(split: Split, folder: Path, file: str = "predictions.jsonl") -> 
 
 
 def truth_text(split: Split) -> str:
-    """The truth as a file of answers."""
+    """Return the content of a file of answers with the ground truth."""
     answers = ({"name": truth.name, **split.track.true_answer(truth)} for truth in split.truths)
     return submission_text(method_header(split, ORACLE, [ORACLE], "The truth itself"), answers)
 

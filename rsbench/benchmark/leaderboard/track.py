@@ -1,7 +1,7 @@
-"""Tracks as data, and the records they exchange: problems with their truth, answers, submissions, scores.
+"""Base class of the leaderboard's tracks, and their data: problems with truth, answers, submissions, scores.
 
-A track is an object of a class below ``Track``; each module of tracks ends with its list ``TRACKS``. Its protocol,
-``id``, never changes: what would change scores is a new protocol with the next number.
+A track is an instance of a subclass of ``Track``; each module of tracks has a list ``TRACKS`` at its end. Its
+protocol, ``id``, never changes: a change that affects scores makes a new protocol with the next number.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ KNOWLEDGE = {
 """Inputs that methods may use, in the order of tables."""
 ORACLE = "truth"
 CHUNK = 10
-"""Problems of one job of a solver."""
+"""Number of problems of one job of a solver."""
 PUBLIC_SEED = 1
 """Seed of the split ``dev``, whose truth is public."""
 LARGEST = 1e9
-"""Limit of the numbers in w and d: larger ones are no motions, and their squares overflow."""
+"""Limit of the components of w and d; larger values are implausible, and their squares may overflow."""
 LEAST_D = 1e-9
-"""Shortest length of ``d``, in metres or the method's own unit, unless it is exactly zero."""
+"""Smallest length of a nonzero ``d``, in metres or the method's own unit."""
 _TEXT_CHARACTERS = 300
 _ANNOUNCED = {
     "b7eafa489ffbd9d816c2edd44f5842bdf01306f286ab36dd2c0ef72aee05523b": "f88c896f00000000",
@@ -76,14 +76,14 @@ _ANNOUNCED = {
         "5fc20df13a159989134fd315cb2af1df41a27ea634296d38d795f268e7dc6878"
     ),
 }
-"""Announced fingerprints of points and recordings, public and held-out, and of the motions of ``laws``. The key is
-the hash of the ground truth rounded to nine digits, which is the same on all processors."""
+"""Announced fingerprints of the splits of points and recordings, public and held-out, and of the motions of the
+dataset ``laws``. The key is a hash of the truth rounded to nine digits, which is the same on all processors."""
 Kind = Literal["share", "mean", "median"]
 Row = dict[str, Any]
 Numbers = dict[str, float]
 Step = Callable[[str], None]
 Checked = tuple[list[str], list[str]]
-"""Faults and likely mistakes, a line each."""
+"""Faults and likely mistakes, one line each."""
 Kept = tuple[Path, str]
 """Folder of stored scores, and their identity."""
 Vector = tuple[float, float, float]
@@ -104,7 +104,7 @@ class Score:
 
     @property
     def sign(self) -> float:
-        """Factor after which larger values are better."""
+        """1 or -1; after multiplication by it, larger values are better."""
         return 1.0 if self.better == "higher" else -1.0
 
 
@@ -113,7 +113,7 @@ SECONDS = Score("seconds", "s", "median time of a problem, as stated", "median")
 
 
 class Limits(NamedTuple):
-    """Time and memory of a method for one problem; its process is ended when it exceeds them. None: no limit."""
+    """Time and memory limits per problem; a process that exceeds them is ended. None: no limit."""
 
     seconds: float | None = None
     memory_mb: float | None = None
@@ -133,7 +133,7 @@ class Header:
     method: str
     """Name of the method on the board: letters, digits, dots, dashes and underscores."""
     uses: tuple[str, ...]
-    """Inputs that the method uses, of those that the protocol gives."""
+    """Names of the inputs that the method uses, out of those that the protocol gives."""
     version: str = ""
     """Version of the method."""
     description: str = ""
@@ -221,7 +221,7 @@ class Answer:
             raise ValueError("covariance: must be symmetric: give both halves of it")
 
     def refuse_numbers(self, instead: str) -> None:
-        """Raises ValueError if the answer contains a motion, a readout ratio or a covariance."""
+        """Raise ValueError if the answer contains a motion, a readout ratio or a covariance."""
         for name in ("w", "d", "readout_ratio", "covariance"):
             if getattr(self, name) is not None:
                 raise ValueError(f"{name}: does not belong here; {instead}")
@@ -257,13 +257,13 @@ class Truth:
     shutter: RollingShutter
     motion: Motion
     scene: str
-    """Problems of one scene are not independent, so intervals are over scenes."""
+    """Name of the scene. Problems of a scene are not independent, so intervals are computed from scene means."""
     facts: dict[str, float | str]
     """Properties of the problem against which figures plot the scores."""
     sequence: Rendered | None = None
-    """The sequence with the ground truth of rendered frames."""
+    """The rendered sequence with its ground truth; None for simulated points."""
     pictures: TruePictures | None = None
-    """Pictures, on tracks whose answers are pictures."""
+    """True pictures, on tracks whose answers are pictures."""
     given_rig: StereoRig | None = None
     """The rig that methods are given, if it is not the true one."""
 
@@ -275,14 +275,14 @@ class Truth:
 
     @property
     def shown(self) -> TruePictures:
-        """The pictures, on tracks whose answers are pictures."""
+        """The true pictures, on tracks whose answers are pictures."""
         assert self.pictures is not None
         return self.pictures
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Split:
-    """All problems of a track with their truth."""
+    """A set of problems of a track, with their ground truth."""
 
     track: Track
     label: str
@@ -319,7 +319,7 @@ def _hash_of(content: object) -> str:
 
 
 def _rounded(content: Any) -> Any:
-    """Numbers rounded to nine digits, because exp and sin differ in the last bit between processors."""
+    """Round numbers to nine digits, because exp and sin differ in the last bit between processors."""
     if isinstance(content, float):
         return f"{content:.9g}"
     if isinstance(content, dict):
@@ -334,7 +334,7 @@ def _identity(truth: Truth) -> dict[str, Any]:
     motion = truth.motion
     if isinstance(
         motion, LaterMotion
-    ):  # two frames of a longer sequence: its motion, and the time of the first one
+    ):  # two frames of a longer sequence, identified by its motion and the time of the first frame
         moved = {"later": motion_record(motion.motion), "start": motion.start}
     else:
         moved = motion_record(motion)
@@ -350,7 +350,7 @@ class Inputs(ABC):
     """The source of the problems of a track."""
 
     rendered: ClassVar[bool] = True
-    """Whether they are rendered frames."""
+    """Whether the problems are rendered frames."""
     whole: ClassVar[bool] = False
     """Whether a problem is a whole sequence."""
 
@@ -370,23 +370,23 @@ class Runnable(NamedTuple):
     """Name of its entry."""
     built_in: bool
     key: object
-    """Everything that determines its answers apart from the inputs; JSON-ready."""
+    """All data that determine its answers, apart from the inputs; it can be written as JSON."""
     header: Mapping[str, Any]
-    """Fields of the header of its predictions."""
+    """Fields of the header of its file of predictions."""
     model: str = "linear"
     """Motion model whose code is compiled before the run."""
 
 
 class Target(NamedTuple):
-    """A card of a job."""
+    """A card that a job runs, and the place of its answers."""
 
     card: str
     folder: Path
-    """Folder of its predictions."""
+    """Folder of the predictions of the card."""
     identity: str
-    """Identity of these answers."""
+    """Identity of the answers of the job, see ``images.store.identity_of``."""
     record: Path
-    """File in which they are stored, for ``images.store.kept``."""
+    """File in which these answers are stored, see ``images.store.keep``."""
 
 
 class Job(NamedTuple):
@@ -401,14 +401,14 @@ class Job(NamedTuple):
 
 
 Solve = Callable[[Job], Iterator[list[dict[str, Any]]]]
-"""Yields the answers of each target of a job."""
+"""Function that solves a job, and yields the answers for each of its targets."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track(ABC):
     """A task of the leaderboard: its inputs, the type of its answers, their scores, and the columns of its tables.
 
-    A track is described by the fields; a subclass implements what tracks with the same type of answer share.
+    The fields describe one track; a subclass implements what tracks with the same type of answer have in common.
     """
 
     name: str
@@ -417,25 +417,25 @@ class Track(ABC):
     """Name of its protocol, which submissions state."""
     title: str
     allowed: tuple[str, ...]
-    """The inputs of ``KNOWLEDGE`` that it gives."""
+    """Names of ``KNOWLEDGE``: the inputs that methods may use."""
     given: str
-    """The inputs, in words."""
+    """Description of the inputs."""
     inputs: Inputs
     scores: tuple[Score, ...]
-    """Columns of its tables; methods are ranked by the first."""
+    """Columns of its tables; methods are ranked by the first one."""
     error: str
-    """The column of scores.csv from which the primary score is computed."""
+    """The error column of scores.csv that belongs to the primary score; it selects the worst problems."""
     error_title: str
-    """Its name in figures."""
+    """Title of this column in figures."""
     exact: Mapping[str, float]
-    """Error columns with a value that no method reaches: smaller errors mean that the ground truth was submitted.
-    Each column is tested separately, so that a wrong part of an answer does not hide an exact one."""
+    """Threshold of each error column that no method reaches: smaller errors show that the ground truth was
+    submitted. Columns are tested separately, so that a wrong part of an answer does not hide an exact one."""
     beside: tuple[str, ...] = ("failure",)
-    """Shares and means that short tables show next to the primary score."""
+    """Keys of the shares and means that short tables show next to the primary score."""
     parting: str = ""
     """A column of scores.csv; tables show the primary score separately for each of its values. Empty: none."""
     unknowns: int = 6
-    """Degrees of freedom of the column ``nees``, where answers state deviations."""
+    """Degrees of freedom of the column ``nees``, if answers have covariances or standard deviations."""
     oracles: tuple[tuple[str, Callable[[Split, Path], str]], ...] = ()
     """Entries that use the truth, in addition to the truth itself: for each, its name and a function that writes
     its pictures into a folder, if there are any, and returns its file of answers."""
@@ -449,14 +449,14 @@ class Track(ABC):
     """Whether an answer consists of pictures in addition to the file of answers. Cards that make them share
     intermediate results of a problem, so that one job runs all of them."""
     own_matches: ClassVar[bool] = False
-    """Whether methods find matches themselves, and may submit them with motions."""
+    """Whether methods find matches themselves, and may submit them with the motions."""
     at_rows: ClassVar[bool] = False
-    """Whether each picture shows the time of one row."""
+    """Whether each picture is a frame corrected to the time of one row."""
 
     # Inputs
 
     def split(self, data: Path | None, seed_file: Path | None = None, secret: bool = False) -> Split:
-        """The problems of a dataset or a seed, with their truth.
+        """Return the problems of a dataset or a seed, with their ground truth.
 
         Raises:
             RsbenchError: an option that the track does not take is given, or a required one is missing; the
@@ -465,7 +465,7 @@ class Track(ABC):
         return self.inputs.split(self, data, seed_file, secret)
 
     def problems(self, data: Path | None, seed_file: Path | None, count: int) -> Iterator[Problem]:
-        """The first ``count`` problems as a method gets them, without images."""
+        """Return the first ``count`` problems as they are given to methods, without images."""
         return self.inputs.problems(self, data, seed_file, count)
 
     @property
@@ -479,61 +479,61 @@ class Track(ABC):
         return "readout" in self.allowed
 
     def requested(self, sequence: Rendered) -> tuple[RequestedPicture, ...]:
-        """The pictures of an answer."""
+        """Return the pictures that an answer must contain."""
         return ()
 
     # Predictions
 
     @abstractmethod
     def true_answer(self, truth: Truth) -> Mapping[str, Any]:
-        """The truth as an answer, without its name and pictures."""
+        """Return the ground truth as an answer, without its name and pictures."""
 
     @abstractmethod
     def example(self, split: Split) -> Mapping[str, Any]:
-        """An example of an answer to the first problem for a template, without its name and pictures."""
+        """Return an example answer to the first problem, for a template, without its name and pictures."""
 
     def draw_truth(self, split: Split, folder: Path) -> None:  # noqa: B027  most tracks have none
-        """Write the pictures of the truth, if any."""
+        """Write the true pictures, if any."""
 
     def draw_example(self, split: Split, folder: Path) -> None:  # noqa: B027
         """Write the pictures of ``example``, if any."""
 
     def files_of(self, submission: Submission, split: Split) -> Iterable[str]:
-        """Paths, below the folder of the file of answers, of the pictures and matches of a submission."""
+        """Return the paths of a submission's pictures and matches, relative to its folder."""
         return ()
 
     def check_files(self, submission: Submission, split: Split, most: int, hints: bool) -> Checked:
-        """Faults of answers and their files, at most ``most``, and with ``hints`` also likely mistakes."""
+        """Return at most ``most`` faults of answers and their files, and with ``hints`` also likely mistakes."""
         return [], []
 
     def notes(self, answers: Sequence[Answer], split: Split) -> Iterator[str]:
-        """Likely mistakes in answers with motions to a public split."""
+        """Yield likely mistakes in submitted motions, by comparison with a public truth."""
         yield from ()
 
     # Running
 
     @abstractmethod
     def runnable(self, card: str) -> Runnable:
-        """The component of a card. Raises RsbenchError: the card is invalid, or does not fit the track."""
+        """Load the component of a card; RsbenchError if the card is invalid, or does not fit the track."""
 
     def load(self, cards: Sequence[str]) -> dict[str, Runnable]:
-        """Runnables by their cards; errors as for ``runnable``."""
+        """Load the components of cards; returns them by card. Errors are those of ``runnable``."""
         return {card: self.runnable(card) for card in cards}
 
     def prepare(self, split: Split, inputs: Path, work: Path, step: Step, features: str | None) -> Path:
-        """Folder of the inputs of cards; a new one in ``work`` if they need more than was exported."""
+        """Return the folder of inputs for cards: ``inputs``, or one in ``work`` if they need additional inputs."""
         return inputs
 
     def copy_files(self, inputs: Path, folder: Path) -> None:  # noqa: B027
-        """Copy the files that a submission has in addition to its answers from these inputs, if there are any."""
+        """Copy from ``inputs`` the files that a submission has in addition to its answers, if there are any."""
 
     @abstractmethod
     def solver_of_jobs(self, inputs: Path, limits: Limits) -> Solve:
-        """Function that solves jobs with exported inputs, in the process of a job."""
+        """Return a function that solves jobs from exported inputs, in the process that runs the jobs."""
 
     def chunk(self, limits: Limits) -> int:
-        """Number of problems of a job: one if there are limits, so that a job that exceeds them fails only one
-        problem."""
+        """Return the number of problems per job: one if there are limits, so that a job that exceeds them is the
+        failure of only one problem."""
         return 1
 
     # Scores
@@ -542,8 +542,7 @@ class Track(ABC):
     def mark(
         self, submissions: Sequence[Submission], split: Split, workers: Workers, step: Step, kept: Kept | None
     ) -> list[pd.DataFrame | RsbenchError]:
-        """Scores of submissions, which share intermediate results of the truth; an error belongs to one
-        submission.
+        """Score submissions, which share intermediate results of the truth; returns a table or an error for each.
 
         A table has one row for each problem, in the order of the split; docs/how-to/submit.md names the columns. A
         problem without an answer is a failure, and a failure gets the worst value of every score.
@@ -551,24 +550,25 @@ class Track(ABC):
         Args:
             submissions: the answers.
             split: the truth.
-            workers: processes that score pictures; the rest takes no time.
+            workers: processes that score pictures; other scores are computed in this process.
             step: called with the name of each problem whose pictures are scored.
-            kept: folder and identity with which an interrupted run stores the scores of pictures, to find them
-                again; None: they are not stored.
+            kept: folder and identity under which scores of pictures are stored, so that an interrupted run
+                resumes; None: they are not stored.
 
         Raises:
             RsbenchError: the truth has changed since the split was read.
         """
 
     def medians_at_bound(self, uses: Collection[str], split: Split) -> Mapping[str, FloatArray]:
-        """For columns of scores.csv, the median (problems,) of errors at the Cramer-Rao bound of the given inputs.
+        """Return the median errors (problems,) at the Cramer-Rao bound of the inputs ``uses``, by error column.
 
-        Infinite if the data determine nothing; no columns if no bound is known.
+        A median is infinite if the data do not determine the value; there are no columns if no bound is known.
         """
         return {}
 
     def part_of(self, truth: Truth) -> Row:
-        """The column ``parting`` of a problem, if the track has one: a property of it, or its motion model."""
+        """Return the column ``parting`` of a problem, if there is one: the property of this name, or else the
+        name of the motion model."""
         return {self.parting: truth.facts.get(self.parting, truth.motion.name)} if self.parting else {}
 
     @property
@@ -577,11 +577,11 @@ class Track(ABC):
         return self.scores[0]
 
     def of_kind(self, *kinds: Kind) -> tuple[str, ...]:
-        """Keys of the scores of these kinds."""
+        """Return the keys of the scores of these kinds."""
         return tuple(score.key for score in self.scores if score.kind in kinds)
 
     def check_uses(self, uses: Collection[str]) -> None:
-        """Raises ValueError if an input is unknown, or is not given by this protocol."""
+        """Raise ValueError if inputs are missing, repeated or unknown, or the protocol does not give them."""
         for name in uses:
             if name not in KNOWLEDGE:
                 raise ValueError(f"uses: {name!r} is unknown{choices(name, KNOWLEDGE)}")
@@ -596,7 +596,7 @@ class Track(ABC):
 
 
 def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataFrame:
-    """``Track.mark`` for one submission.
+    """Score one submission, see ``Track.mark``.
 
     Raises:
         RsbenchError: a picture is invalid, or the truth has changed since the split was read.
@@ -608,7 +608,7 @@ def mark(submission: Submission, split: Split, workers: Workers = 1) -> pd.DataF
 
 
 def score_row(truth: Truth, answer: Answer | None, success: bool, scores: Mapping[str, object]) -> Row:
-    """A row of scores.csv: the problem, the scores of its answer, success and run time."""
+    """Return a row of scores.csv: the problem, the scores of its answer, success and run time."""
     seconds = math.nan if answer is None or answer.seconds is None else answer.seconds
     row = {"problem": truth.name, "scene": truth.scene, "success": success, **scores}
     return {**row, "failure": float(not success), "seconds": seconds}

@@ -21,7 +21,7 @@ _BY_PROTOCOL = {track.id: track for track in TRACKS.values()}
 
 
 def track_of_name(name: str) -> Track:
-    """A track by its name, or by that of its protocol.
+    """Return the track with this name, or with the protocol of this name.
 
     Raises:
         RsbenchError: there is no such track.
@@ -33,7 +33,7 @@ def track_of_name(name: str) -> Track:
 
 
 def track_of_id(protocol: str) -> Track:
-    """Raises RsbenchError: there is no such protocol."""
+    """Return the track of a protocol; RsbenchError if there is no such protocol."""
     if protocol not in _BY_PROTOCOL:
         raise RsbenchError(f"protocol = {protocol!r}: does not exist{choices(protocol, _BY_PROTOCOL)}")
     return _BY_PROTOCOL[protocol]

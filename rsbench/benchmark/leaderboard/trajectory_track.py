@@ -1,7 +1,7 @@
 """The track of trajectories of whole sequences, from the matches of successive frames.
 
 An answer consists of poses at times chosen by the method; a cubic spline interpolates them. Rotations are scored
-at lines of all frames, drift at the starts of the frames, and the visible effect by true points.
+at lines of all frames, drift at the starts of the frames, and jitter by true points in corrected frames.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ from rsbench.jobs.process_jobs import Workers
 from rsbench.pipeline.problem import Problem
 
 _MOST_POSES = 500
-"""Largest number of poses of an answer: a line of a file of answers has limited length."""
+"""Largest number of poses of rsbench's answers, because the lines of a file of answers have limited length."""
 APART = 1e-5
-"""Least time between two poses of an answer, frame periods: rows are farther apart, and a spline through closer
+"""Smallest time between two poses of an answer, frame periods. Rows are farther apart, and a spline through closer
 poses may deviate arbitrarily."""
 _UNIT = 1e-3
 _REACH = 1e-6
-"""Largest distance, frame periods, of the first and the last pose from the starts of the first and the last
-frame."""
+"""Tolerance, frame periods, with which the poses must reach from the start of the first frame to that of the last
+one."""
 _INVERTED = 10.0
 """Poses are reported as inverted if inverting them reduces the error by at least this factor."""
 _FAILURE = {
@@ -121,7 +121,7 @@ class TrajectoryAnswer(Answer):
     """A trajectory, or a failure."""
 
     poses: Poses | None = None
-    """Rows ``tau, tx, ty, tz, qx, qy, qz, qw``: frame periods, and the pose of the body in a fixed world."""
+    """Rows ``tau, tx, ty, tz, qx, qy, qz, qw``: time in frame periods, and ``world_from_body``."""
     metric: bool = False
     """Whether positions are in metres; if not, they are unknown."""
 
@@ -144,12 +144,12 @@ class TrajectoryAnswer(Answer):
 
     @property
     def rows(self) -> FloatArray:
-        """(n, 8) the poses of a success."""
+        """Poses (n, 8) of a successful answer."""
         return np.array(self.poses or (), dtype=np.float64)
 
     @cached_property
     def motion(self) -> TrajectoryMotion:
-        """The motion through the poses of a success. Raises ValueError if they define none."""
+        """Motion through the poses of a successful answer; ValueError if they do not define one."""
         rows = self.rows
         rows[:, 4:] /= np.linalg.norm(rows[:, 4:], axis=1, keepdims=True)
         poses = {"poses": rows}
@@ -158,7 +158,7 @@ class TrajectoryAnswer(Answer):
 
 
 class TrajectoryTrack(Track):
-    """Whole sequences of rendered frames."""
+    """A track of trajectories of whole rendered sequences."""
 
     answers = TrajectoryAnswer
 
@@ -237,7 +237,7 @@ class TrajectoryTrack(Track):
 
 
 def _is_inverted(answer: TrajectoryAnswer, truth: Truth) -> bool:
-    """Whether a trajectory is much closer to the truth if each pose is inverted."""
+    """Return whether a trajectory is much closer to the truth if each pose is inverted."""
     tau = np.arange(float(truth.rendered.frames))
     found, true = (each.body_from_world(tau).R for each in (answer.motion, truth.motion))
     as_is, turned = (np.max(so3.angle(R @ np.swapaxes(true, 1, 2))) for R in (found, np.swapaxes(found, 1, 2)))
@@ -245,7 +245,7 @@ def _is_inverted(answer: TrajectoryAnswer, truth: Truth) -> bool:
 
 
 def _row(truth: Truth, true: TrueTrajectory, answer: Answer | None) -> Row:
-    """Scores of an answer to one problem."""
+    """Return the scores of an answer to one problem."""
     success = isinstance(answer, TrajectoryAnswer) and answer.success
     found = dict(_FAILURE)
     if isinstance(answer, TrajectoryAnswer) and success:
@@ -256,7 +256,7 @@ def _row(truth: Truth, true: TrueTrajectory, answer: Answer | None) -> Row:
 
 
 def answer_of(estimate: Estimate, shutter: RollingShutter, frames: int) -> dict[str, Any]:
-    """A trajectory as an answer: poses at lines of all frames of the left camera.
+    """Convert a trajectory to an answer, with poses at lines of all frames of the left camera.
 
     Raises:
         RsbenchError: a part of the trajectory is unknown.

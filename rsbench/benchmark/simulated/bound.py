@@ -1,7 +1,7 @@
 """The Cramer-Rao bound of the motion from exact correspondences: the error of the best unbiased solver.
 
-Every point has three unknowns, its position, which are eliminated from the derivatives of its implicit
-rolling-shutter projections: a pixel that moves to another row is also read at another time.
+The unknown position of each point is eliminated from the derivatives of its rolling-shutter projections. These are
+implicit functions, because a pixel that moves to another row is also read at another time.
 
 One camera determines the length of d millions of times less well than the other parameters. The square of that
 ratio in an information matrix would be below rounding. Therefore all computations use its root B, F = B^T B:
@@ -41,14 +41,14 @@ _SINGULAR = 1e-11
 """Singular values below this share of the largest one count as 0. Undetermined directions have 1e-13; the least
 determined ones observed had 1e-7."""
 _OPEN = 3e-7
-"""Share of a point's largest singular value below which its position is undetermined: along a ray without
-parallax."""
+"""Singular values of a point below this share of its largest one count as 0; they belong to its position along a
+ray without parallax."""
 _FAR_M = 1e6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bound:
-    """Least root mean square errors of an unbiased solver; infinite if the data determine nothing."""
+    """Smallest root mean square errors of an unbiased solver; infinite if the data do not determine the value."""
 
     rotation_axes: FloatArray
     """Standard deviations (3,) of the rotation along its principal axes, radians, largest first."""
@@ -57,7 +57,7 @@ class Bound:
     scale: float
     """Standard deviation of the length of d, relative to it."""
     root: FloatArray
-    """(6, 6) B of the Fisher information B^T B of (w, d)."""
+    """(6, 6) root B of the Fisher information B^T B of (w, d)."""
 
     @property
     def information(self) -> FloatArray:
@@ -93,12 +93,12 @@ def motion_bound(
     noise_px: float,
     views: Views = "four-view",
 ) -> Bound:
-    """Bound for exact (noise-free) correspondences that will get noise of ``noise_px`` on every coordinate.
+    """Compute the bound for noise of ``noise_px`` on every coordinate, from exact (noise-free) correspondences.
 
     Args:
         correspondences: left and right pairs, and tracks; no match may be in two sets.
         motion: the true motion; its model and the model's own parameters count as known.
-        views: the part of the tracks that a solver gets.
+        views: the part of the tracks that a solver uses.
     """
     roots = []
     tracks = correspondences.tracks
@@ -116,11 +116,10 @@ def motion_bound(
 def bound_of_one_camera(
     matches: FloatArray, rig: StereoRig, shutter: RollingShutter, motion: Motion, noise_px: float
 ) -> Bound:
-    """Bound on the left camera's own motion from its exact matches (n, 4), as a rig of one camera under the same
-    motion model.
+    """Compute the bound of the left camera's own motion from its exact matches (n, 4), as a rig of one camera with
+    the same motion model.
 
-    As a part of a rig, its known position in the body would add information on the length, and less on the
-    direction.
+    In a rig, its known position in the body would add information on the length, and less on the direction.
     """
     R, d = rig.own("left").R, translation_of_offset(motion.w, motion.d, rig.offset("left"))
     own = make_motion(motion.name, R @ motion.w, R @ d, motion.parameters)
@@ -129,12 +128,12 @@ def bound_of_one_camera(
 
 
 def joined(*roots: FloatArray) -> FloatArray:
-    """Root (6, 6) of the sum of the matrices with the roots (n, 6): independent matches add their information."""
+    """Return the root (6, 6) of the sum of matrices with roots (n, 6): independent matches add information."""
     return np.asarray(np.linalg.qr(np.concatenate([np.zeros((6, 6)), *roots]), mode="r"))
 
 
 def bound_from_root(root: FloatArray, w: FloatArray, d: FloatArray) -> Bound:
-    """Bound of the motion (w, d), of any point of the rig, from the root (6, 6) of its Fisher information."""
+    """Compute the bound of (w, d), for any reference point, from the root (6, 6) of the Fisher information."""
     length = float(np.linalg.norm(d))
     J = so3.left_jacobian(w)
     rotation = _marginal_axes(root, J @ np.eye(6)[:3])
@@ -152,19 +151,19 @@ def bound_from_root(root: FloatArray, w: FloatArray, d: FloatArray) -> Bound:
 
 
 def _scale(root: FloatArray) -> FloatArray:
-    """Factors (6,) that give columns unit length, except columns that are zero up to rounding."""
+    """Return the lengths (6,) of the columns, as divisors; columns that are nearly 0 get the largest length."""
     lengths = np.linalg.norm(root, axis=0)
     most = float(np.max(lengths)) or 1.0
     return np.where(lengths > _SINGULAR * most, lengths, most)
 
 
 def _marginal_axes(root: FloatArray, target: FloatArray) -> FloatArray:
-    """Standard deviations (k,) of ``target @ (w, d)`` along its principal axes; infinite if it is not orthogonal
-    to the null space.
+    """Return the standard deviations (k,) of ``target @ (w, d)`` along its principal axes; infinite if the target
+    is not orthogonal to the null space, so that the data do not determine it.
 
     Args:
-        root: (6, 6) of the information.
-        target: (k, 6).
+        root: (6, 6) root of the information.
+        target: (k, 6) linear functions.
     """
     scale = _scale(root)
     _, values, rows = np.linalg.svd(root / scale)
@@ -213,8 +212,8 @@ def _track_root(
 
 
 def _triangulated(tracks: FloatArray, rig: StereoRig, shutter: RollingShutter, motion: Motion) -> FloatArray:
-    """Points (n, 3) nearest to the four rays of exact tracks (n, 8), each from the camera's position at its
-    time."""
+    """Return the points (n, 3) nearest to the four rays of exact tracks (n, 8), with camera poses at the times of
+    the pixels."""
     A, b = np.zeros((len(tracks), 3, 3)), np.zeros((len(tracks), 3))
     for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
         pixels = tracks[:, 2 * k : 2 * k + 2]
@@ -233,13 +232,14 @@ def root_information(
     points: FloatArray,
     seen: list[tuple[Side, int, FloatArray]],
 ) -> FloatArray:
-    """Root (m, 6) of the Fisher information of (w, d) at a noise of 1 px, for points (n, 3) of unknown position.
+    """Return the root (m, 6) of the Fisher information of (w, d) for points (n, 3) of unknown position and a noise
+    of 1 px.
 
     Args:
-        seen: for each image that sees all the points, its side, frame and their lines (n,).
+        seen: side, frame and the points' lines (n,) of each image; every image sees all points.
     """
     taus = [shutter.line_time(lines, frame, side) for side, frame, lines in seen]
-    # All images at once: for few points the calls take longer than the arithmetic.
+    # Processes all images at once, because for few points the calls take longer than the arithmetic.
     everywhere = np.concatenate(taus), np.tile(points, (len(seen), 1))
     moved = np.split(np.stack([_derivative(motion, *everywhere, axis) for axis in np.eye(6)], axis=-1), len(seen))
     parts = [
@@ -266,7 +266,7 @@ def _projection_jacobian(
     tau: FloatArray,
     moved: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (n, 2, 6) and (n, 2, 3) of the implicit projection by (w, d) and by the point.
+    """Return the derivatives (n, 2, 6) and (n, 2, 3) of the implicit projection by (w, d) and by the point.
 
     Args:
         tau: (n,) times at which the points are seen.
@@ -286,14 +286,14 @@ def _projection_jacobian(
     P = np.zeros((len(points), 2, 3))
     P[:, 0, 0], P[:, 0, 2] = camera.fx / z, -camera.fx * x[:, 0] / z**2
     P[:, 1, 1], P[:, 1, 2] = camera.fy / z, -camera.fy * x[:, 1] / z**2
-    # Pixels move by P dx + (P velocity) h dy with their own row's dy: solve for dy, then insert it.
+    # A pixel moves by P dx + (P velocity) h dy, where dy is its own change of row: solve for dy, then insert it.
     drift = shutter.h * (P @ velocity[:, :, None])
     follow = np.eye(2) + drift * np.array([0.0, 1.0]) / (1.0 - drift[:, 1:])
     return follow @ P @ moved, follow @ P @ R
 
 
 def _derivative(motion: Motion, tau: FloatArray, points: FloatArray, axis: FloatArray) -> FloatArray:
-    """Derivative of points (n, 3), in the body at times (n,), by the motion's end (w, d) along an axis (6,)."""
+    """Return the derivative (n, 3) of points in the body at times (n,) by (w, d) along an axis (6,)."""
 
     def moved(step: float) -> FloatArray:
         w, d = motion.w + step * axis[:3], motion.d + step * axis[3:]

@@ -1,7 +1,7 @@
-"""The contract of solvers, as named checks: for authors (``rsbench check-solver``) and for our own tests.
+"""The contract of solvers as named checks, for ``rsbench check-solver`` and our own tests.
 
-Each check uses exact simulated data that follow the motion model and shutter of the solver. A solver need not be
-exact: the error of a linearised one must decrease as the motion becomes smaller.
+Each check uses simulated data that follow the motion model and shutter of the solver. A solver need not be exact:
+the error of a linearised one must decrease as the motion becomes smaller.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ from rsbench.solvers.engine.base import (
 )
 
 _CLOSE = 0.2
-"""Largest error, as a share of the rotation angle and as an angle of the direction, radians, for which a mistake
-is recognised: no two mistakes are closer."""
+"""Tolerance with which a mistake is recognised, as a share of the rotation angle and as an angle of the direction,
+radians; the motions of two mistakes differ by more."""
 
 
 def misreading(
     w: FloatArray, d: FloatArray, true_w: FloatArray, true_d: FloatArray, rig: StereoRig, point: str
 ) -> str | None:
-    """The common mistake that would give this motion instead of the true one; None if there is none.
+    """Return the common mistake that explains an estimated motion; None if the motion is right, or none does.
 
     Args:
-        w, d: (3,) the solver's motion.
-        true_w, true_d: (3,) the true motion of the body.
+        w, d: (3,) estimated motion.
+        true_w, true_d: (3,) true motion of the body.
         rig: the cameras.
-        point: the reference point of the solver.
+        point: reference point of the solver.
     """
     # The error of the rotation divided by its angle, and the angle between the translations in radians.
     errors = {
@@ -70,7 +70,7 @@ def misreading(
 def _misreadings(
     w: FloatArray, d_body: FloatArray, rig: StereoRig, point: str
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """The motion that each mistake gives; the empty text stands for the truth itself."""
+    """Return the motion that results from each mistake; the empty text is the key of the true motion."""
     points = {"body": d_body} | {side: translation_of_offset(w, d_body, rig.offset(side)) for side in SIDES}
     d = points[point]
     found = {
@@ -108,14 +108,14 @@ class Answer:
 
     estimate: MotionEstimate
     changed: tuple[str, ...] = ()
-    """Sets of matches that it modified."""
+    """Names of the sets of matches that the call modified."""
     printed: str = ""
 
 
 class Subject:
     """A solver whose answers are checked; close it after use.
 
-    An entry of another package runs in a child process, so that it may hang, exit or crash.
+    An entry of another package runs in a child process, which may hang, exit or crash.
     """
 
     def __init__(self, entry: SolverEntry, *, isolated: bool, time_limit_s: float) -> None:
@@ -123,7 +123,7 @@ class Subject:
         Args:
             entry: the solver.
             isolated: whether it runs in a child process.
-            time_limit_s: for one problem, in a child process.
+            time_limit_s: time limit per problem, in a child process.
         """
         self.entry = entry
         self.spec: SolverSpec = entry.solver.spec
@@ -140,11 +140,11 @@ class Subject:
     def estimate(
         self, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
     ) -> MotionEstimate:
-        """Return a valid answer.
+        """Solve a problem, and check the answer.
 
         Raises:
-            BrokenContractError: it raised an exception, took too long, ended its process, or the answer is
-                invalid.
+            BrokenContractError: the solver raised an exception, took too long or ended its process, or its answer
+                is invalid.
         """
         if self._worker is None:
             try:
@@ -165,7 +165,7 @@ class Subject:
         return answer.estimate
 
     def _check(self, estimate: MotionEstimate) -> None:
-        """Checks in addition to those of ``checked_estimate``."""
+        """Check what ``checked_estimate`` does not."""
         if not estimate.success and not estimate.reason:
             raise BrokenContractError("returned a failure without a reason")
         if estimate.success and estimate.metric and not self.spec.metric:
@@ -182,7 +182,7 @@ class Subject:
 
 
 def _serve(place: str) -> Callable[..., object]:
-    """The function that solves problems in the child process."""
+    """Return the function that solves problems in the child process."""
     try:
         solver = load_solver_entry(place).solver
     except BaseException as error:
@@ -193,10 +193,10 @@ def _serve(place: str) -> Callable[..., object]:
 def _looked_at(
     solver: Solver, correspondences: Correspondences, rig: StereoRig, shutter: RollingShutter
 ) -> Answer:
-    """One answer, and the output and changes of the call.
+    """Call a solver once; return its estimate, its output, and the matches that it modified.
 
     Raises:
-        EntryFailure: it raised an exception, or its answer is invalid.
+        EntryFailure: the solver raised an exception, or its answer is invalid.
     """
     given = Correspondences(**vars(correspondences))  # copies that are read-only
     before = {field.name: getattr(given, field.name).tobytes() for field in fields(given)}
@@ -216,7 +216,7 @@ RIG = StereoRig(camera=PinholeCamera.centred(900, 900, 810.0), baseline=0.6)
 ROLLING = RollingShutter(height=900, readout_ratio=0.8)
 GLOBAL = RollingShutter(height=900, readout_ratio=0.0)
 W, D = np.array([0.012, -0.02, 0.016]), np.array([0.2, -0.12, 0.18])
-"""Motion of 1.6 degrees and 0.3 m per frame, as large as the paper's, along no axis."""
+"""Motion of 1.6 degrees and 0.3 m per frame, as large as the paper's; w and d are not parallel to an axis."""
 
 Verdict = Literal["passed", "warning", "failed", "skipped"]
 
@@ -228,7 +228,7 @@ class Finding:
     check: str
     verdict: Verdict
     why: str = ""
-    """The measurement, or the fault."""
+    """The measured errors, or the fault."""
 
 
 def check_solver(
@@ -238,8 +238,8 @@ def check_solver(
 
     Args:
         entry: the solver.
-        isolated: whether it runs in a child process; by default if it is not part of rsbench.
-        time_limit_s: for one problem; by default that of its card.
+        isolated: whether it runs in a child process; by default only if it is not part of rsbench.
+        time_limit_s: time limit per problem; by default that of its card.
     """
     limit = entry.options.time_limit_s if time_limit_s is None else time_limit_s
     findings: list[Finding] = []
@@ -259,8 +259,8 @@ def check_solver(
 
 
 def own_problem(subject: Subject, size: float = 1.0, seed: int = 5, noise_px: float = 0.0) -> Simulation:
-    """Problem with 60 + 60 matches and 60 tracks that follow the assumptions of the solver, under ``size`` times
-    the motion."""
+    """Simulate a problem of 60 + 60 matches and 60 tracks that follow the solver's assumptions, under ``size``
+    times the motion (W, D)."""
     shutter = ROLLING if subject.spec.shutter == "rolling" else GLOBAL
     try:
         motion = make_motion(subject.spec.motion_model, size * W, size * D, subject.spec.motion_parameters)
@@ -279,7 +279,7 @@ def own_problem(subject: Subject, size: float = 1.0, seed: int = 5, noise_px: fl
 
 
 def given(subject: Subject, simulation: Simulation) -> Correspondences:
-    """The matches of a simulation, with left-right matches if the solver needs them."""
+    """Return the matches of a simulation, with left-right matches if the solver needs them."""
     c = simulation.correspondences
     if "stereo" not in {*subject.spec.needs, *subject.spec.minimum}:
         return c
@@ -287,13 +287,13 @@ def given(subject: Subject, simulation: Simulation) -> Correspondences:
 
 
 def true_translation(subject: Subject, simulation: Simulation) -> FloatArray:
-    """True translation of the point whose translation the solver gives."""
+    """Return the true translation of the solver's reference point."""
     w, d = simulation.motion.w, simulation.motion.d
     return d if subject.spec.reference_point == "body" else translation_of_offset(w, d, RIG.offset("left"))
 
 
 def _solved(subject: Subject, simulation: Simulation, matches: Correspondences | None = None) -> MotionEstimate:
-    """The answer, which must be a success, to data that the solver must be able to solve."""
+    """Solve data that a solver must be able to solve; BrokenContractError if it fails."""
     matches = given(subject, simulation) if matches is None else matches
     estimate = subject.estimate(matches, RIG, simulation.shutter)
     if not estimate.success:
@@ -312,11 +312,11 @@ def answers(subject: Subject) -> tuple[Verdict, str]:
 
 _SIZES, _SEEDS = (1.0, 0.5, 0.25), (5, 6, 7)
 _EXACT = 1e-6
-"""Largest errors of an exact solver (share of the angle, direction in radians, logarithm of length), due to
-rounding and the last step of a descent."""
+"""Limits of the errors of an exact solver (share of the angle, direction in radians, logarithm of the length), for
+rounding and the last step of an iterative solver."""
 _LARGEST, _BIAS = 0.1, (0.02, 0.005, 0.02)
-"""Largest errors of a linearised solver at the paper's motion, and those that remain however small the motion is.
-The latter distinguish a bias of the method from a wrong reference point, whose direction errs by 0.03 rad."""
+"""Limits of the errors of a linearised solver at the paper's motion, and of errors that remain however small the
+motion is. The latter distinguish a bias of the method from a wrong reference point, which errs by 0.03 rad."""
 
 
 def finds_the_truth(subject: Subject) -> tuple[Verdict, str]:
@@ -338,7 +338,7 @@ def finds_the_truth(subject: Subject) -> tuple[Verdict, str]:
 
 
 def _errors(subject: Subject, size: float, seed: int) -> tuple[float, float, float]:
-    """Errors of rotation (share of its angle), direction (rad) and length (log; NaN when it is not metric)."""
+    """Return the errors of rotation (share of its angle), direction (rad) and length (log; NaN if not metric)."""
     simulation = own_problem(subject, size, seed)
     estimate, d = _solved(subject, simulation), true_translation(subject, simulation)
     rotation = rotation_error(estimate.w, simulation.motion.w) / np.linalg.norm(simulation.motion.w)
@@ -370,7 +370,7 @@ def ignores_the_order(subject: Subject) -> tuple[Verdict, str]:
     """The same matches in another order give the same motion."""
 
     def shuffled(c: Correspondences) -> Correspondences:
-        # Rows of different sets that belong together get the same order, by equal generators.
+        # Equal generators give the same order to corresponding rows of different sets.
         orders = {name: np.random.default_rng(1).permutation(len(matches)) for name, matches in vars(c).items()}
         return Correspondences(**{name: matches[orders[name]] for name, matches in vars(c).items()})
 
@@ -412,7 +412,7 @@ def mirrors(subject: Subject) -> tuple[Verdict, str]:
 
 
 _SAME_W, _SAME_D = 1e-6, 1e-5
-"""Largest differences, radians and share of the length, of two descents that take different paths."""
+"""Tolerances, radians and share of the length, for iterative solvers that converge on different paths."""
 
 
 def _agree(
@@ -422,8 +422,8 @@ def _agree(
     sign_d: FloatArray,
     words: str,
 ) -> tuple[Verdict, str]:
-    """Compare motions from changed matches: they must be equal on exact data; with 0.3 px of noise, a difference
-    is a warning."""
+    """Compare the motions from matches and from changed matches: on exact data they must be equal; with 0.3 px of
+    noise, a difference is a warning."""
     severity: dict[float, Verdict] = {0.0: "failed", 0.3: "warning"}
     for noise_px, verdict in severity.items():
         simulation = own_problem(subject, noise_px=noise_px)
@@ -439,7 +439,7 @@ def _agree(
 
 
 def is_deterministic(subject: Subject) -> tuple[Verdict, str]:
-    """The same matches give the same bytes."""
+    """The same matches give the same motion to the last bit."""
     simulation = own_problem(subject, noise_px=0.3)
     first, second = (_solved(subject, simulation) for _ in range(2))
     if first.w.tobytes() != second.w.tobytes() or first.d.tobytes() != second.d.tobytes():
@@ -482,7 +482,7 @@ def leaves_its_input_alone(subject: Subject) -> tuple[Verdict, str]:
 
 
 def is_quiet(subject: Subject) -> tuple[Verdict, str]:
-    """No call so far printed."""
+    """No call so far printed anything."""
     first = subject.printed.strip().partition("\n")[0]
     return ("warning", f"prints: {first!r}") if first else ("passed", "")
 
@@ -501,7 +501,7 @@ CHECKS: Mapping[str, Callable[[Subject], tuple[Verdict, str]]] = {
 
 
 def degenerate_cases() -> dict[str, tuple[Correspondences, RollingShutter]]:
-    """Matches that determine no motion, or only a part of it."""
+    """Return matches that determine no motion, or only a part of it, by the name of the case."""
     rng = np.random.default_rng(2)
     options = SimulationOptions(pairs=30, tracks=30, gyro_rate=GYRO_RATE, gravity=True, affine=True)
 

@@ -1,6 +1,6 @@
 """Run a sweep in chunks of trials; results do not depend on the number of workers.
 
-A folder holds
+The folder of a sweep contains
 
     sweep.json           the card, the solvers, the cells
     trials/NNN.npz       truth and predictions of a cell (see ``trials.run_trials``; reasons as codes)
@@ -46,9 +46,9 @@ from rsbench.storage.work_folder import listed, remove, work_folder
 
 FORMAT = 1
 CHUNK = 50
-"""Trials of one job."""
+"""Number of trials of one job."""
 Progress = Callable[[str], None]
-"""Called with the name of the variant after each chunk."""
+"""Function that is called with the name of the variant after each chunk."""
 _KINDS = ("trials", "bounds", "seconds")
 _OURS = re.compile(r"[0-9]{3,}\.npz")
 """Names of the files of cells."""
@@ -65,7 +65,7 @@ class _Part(NamedTuple):
         return out / self.kind / f"{self.cell.index:03d}.npz"
 
     def chunk(self, first: int) -> str:
-        """Name of the file of some of its trials, from number ``first``."""
+        """Return the file name of a chunk whose first trial is ``first``."""
         return f"{self.kind}-{self.cell.index:03d}-{first:06d}.npz"
 
 
@@ -85,12 +85,12 @@ class _Job(NamedTuple):
 
 
 def sweep_steps(card: SweepCard) -> int:
-    """Number of chunks, for the progress bar."""
+    """Return the number of chunks, for the progress bar."""
     return len(_parts(card)) * len(_firsts(card))
 
 
 def _firsts(card: SweepCard) -> range:
-    """Numbers of the first trials of chunks."""
+    """Return the number of the first trial of each chunk."""
     return range(0, card.trials, CHUNK)
 
 
@@ -101,7 +101,7 @@ def _parts(card: SweepCard) -> list[_Part]:
 
 
 def geometry_of(card: SweepCard, cell: Cell) -> Cell:
-    """The first cell with the same exact matches; noise and the inputs of solvers may differ."""
+    """Return the first cell with the same exact matches; noise and the inputs of solvers may differ."""
     exact = cell.setting.exact()
     return next(other for other in card.cells() if other.setting.exact() == exact)
 
@@ -115,21 +115,21 @@ def run_sweep(
     time_limit_s: float | None = None,
     force: bool = False,
 ) -> None:
-    """Run the chunks that are not yet in ``out``.
+    """Run the chunks of a sweep that are not yet in ``out``.
 
     An exception such as Ctrl-C ends all processes at once; finished chunks are kept.
 
     Args:
         card: the experiment.
-        out: folder, made if missing.
-        workers: processes, each with one thread.
+        out: folder of the results, created if missing.
+        workers: number of processes, each with one thread.
         progress: see ``Progress``.
-        time_limit_s: for one problem of another package's solver, instead of what its card says.
+        time_limit_s: time limit per problem for solvers of other packages, instead of that of their cards.
         force: whether to run all chunks again.
 
     Raises:
-        RsbenchError: no such solver, or two of one name; ``out`` holds another sweep; a motion leaves too few
-            points in view; a worker was killed each time over the same trials.
+        RsbenchError: a solver does not exist, or two have the same name; ``out`` contains another sweep; too few
+            points are in view under a motion; workers were killed repeatedly on the same trials.
     """
     step, solvers = progress or (lambda word: None), entrants(card)
     with work_folder(out) as hidden:
@@ -147,7 +147,7 @@ def run_sweep(
                 else:
                     todo.append(_Job(card, part, first, min(CHUNK, card.trials - first), path))
         if todo:
-            warm_up(_motions(card, solvers))  # once, so that the workers need not
+            warm_up(_motions(card, solvers))  # compile once, instead of in every worker
         for part in _run_all(todo, workers, time_limit_s):
             step(part.cell.variant)
         for part in _parts(card):
@@ -156,7 +156,7 @@ def run_sweep(
 
 
 def read_trials(out: Path, card: SweepCard, cell: Cell) -> Arrays:
-    """Stored truth and predictions of a cell.
+    """Read the stored truth and predictions of a cell.
 
     Raises:
         RsbenchError: the file is damaged.
@@ -170,7 +170,7 @@ def read_trials(out: Path, card: SweepCard, cell: Cell) -> Arrays:
 
 
 def read_bounds(out: Path, card: SweepCard, cell: Cell) -> Arrays:
-    """Stored bounds of a cell, for a noise of 1 px.
+    """Read the stored bounds of a cell, for a noise of 1 px.
 
     Raises:
         RsbenchError: the file is damaged.
@@ -193,7 +193,7 @@ _TRIALS = {
     "reason_code": ("i", (0,)),
 }
 _BOUNDS = {"rotation": ("f", (0, 3)), "direction": ("f", (0, 2)), "scale": ("f", (0,))}
-"""Kind of the arrays of a part, and their shape after the trials; 0 stands for the number of solvers."""
+"""Kind of the dtype of each array, and its shape after the axis of trials; 0 stands for the number of solvers."""
 
 
 def _checked(
@@ -208,10 +208,10 @@ def _checked(
 
 
 def read_sweep(folder: Path) -> dict[str, Any]:
-    """sweep.json of a finished run.
+    """Read the sweep.json of a finished run.
 
     Raises:
-        RsbenchError: no such file, of another format, or damaged.
+        RsbenchError: the file is missing, damaged, or of another format.
     """
     path = folder / "sweep.json"
     content = read_json(path)
@@ -230,16 +230,16 @@ def read_sweep(folder: Path) -> dict[str, Any]:
 
 
 def entrants(card: SweepCard) -> list[Entrant]:
-    """The solvers of a card.
+    """Load the solvers of a card.
 
     Raises:
-        RsbenchError: no such solver, or two solvers of one name, which tables and seeds cannot distinguish.
+        RsbenchError: a solver does not exist, or two have the same name, which must be unique in tables and seeds.
     """
     return [enter(entry) for entry in load_solver_entries(card.solvers)]
 
 
 def _plan(card: SweepCard, solvers: list[Entrant]) -> dict[str, Any]:
-    """Everything that determines the results of a run."""
+    """Return all data that determine the results of a run."""
     content = {
         "format": FORMAT,
         "rsbench": __version__,
@@ -254,7 +254,7 @@ def _plan(card: SweepCard, solvers: list[Entrant]) -> dict[str, Any]:
 
 
 def _rigs(card: SweepCard) -> dict[str, Any]:
-    """Contents of the rig cards that the sweep names; empty if it names none."""
+    """Return the contents of the rig cards that a sweep names; empty if it names none."""
     named = {cell.setting.rig_card: cell.setting.tables for cell in card.cells()}
     found = {
         name: asdict(tables) for name, tables in named.items() if isinstance(name, str) and tables is not None
@@ -263,7 +263,7 @@ def _rigs(card: SweepCard) -> dict[str, Any]:
 
 
 def _motions(card: SweepCard, solvers: list[Entrant]) -> list[str]:
-    """Motion models of the data and of the solvers."""
+    """Return the motion models of the data and of the solvers."""
     return sorted({e.solver.spec.motion_model for e in solvers} | {c.setting.motion_model for c in card.cells()})
 
 
@@ -281,7 +281,7 @@ def _identity(e: Entrant) -> dict[str, Any]:
 
 
 def simulator_version() -> str:
-    """Hash of the sources of the simulation; the sources of solvers are in their keys."""
+    """Return a hash of the sources of the simulation; the keys of solvers include their own sources."""
     package = resources.files("rsbench")
     simulator = package / "benchmark" / "simulated"
     files = [package / "components" / "seeds.py", *(simulator / name for name in _SIMULATOR)]
@@ -311,7 +311,7 @@ def _open_folder(plan: dict[str, Any], out: Path, force: bool) -> None:
 
 
 def _differences(stored: dict[str, Any], plan: dict[str, Any]) -> list[str]:
-    """Differences to a stored run because of which it cannot be continued, in words."""
+    """Return the differences between a stored run and a plan, in words; with any, the run cannot be continued."""
     fields = [key for key in plan["card"] if stored.get("card", {}).get(key) != plan["card"][key]]
     if fields:
         return [f"differs in {', '.join(fields)}"]
@@ -328,17 +328,17 @@ def _differences(stored: dict[str, Any], plan: dict[str, Any]) -> list[str]:
 
 
 def _run_all(todo: list[_Job], workers: Workers, time_limit_s: float | None) -> Iterator[_Part]:
-    """Run jobs in child processes, in which BLAS has one thread and therefore a fixed order of summation."""
+    """Run jobs in child processes with one BLAS thread, which fixes the order of sums; yield their parts."""
     with closing(finished_jobs(_serve_jobs, todo, workers, ONE_THREAD, time_limit_s)) as found:
         for job, _ in found:
             yield job.part
 
 
 def _serve_jobs(time_limit_s: float | None) -> Callable[[_Job], None]:
-    """Function that does jobs, in a child process."""
+    """Return the function that runs jobs in a child process."""
     use_one_thread()
     warm_up()
-    runner = SolverRunner(time_limit_s=time_limit_s, single_thread=True)  # as long as this process
+    runner = SolverRunner(time_limit_s=time_limit_s, single_thread=True)  # lives as long as this process
     return lambda job: run_job(job, runner)
 
 
@@ -346,7 +346,7 @@ def run_job(job: _Job, runner: SolverRunner) -> None:
     """Simulate, solve and store one chunk.
 
     Raises:
-        RsbenchError: a motion leaves too few points in view.
+        RsbenchError: too few points are in view under a motion.
     """
     card, cell = job.card, job.part.cell
     if job.part.kind == "bounds":
@@ -387,7 +387,7 @@ _IDEAL_DRAWS = 100
 
 
 def read_card(folder: Path) -> SweepCard:
-    """The card that a folder was made from.
+    """Read the card from which a folder of results was made.
 
     Raises:
         RsbenchError: the folder holds no sweep.
@@ -427,13 +427,13 @@ def summarise_sweep(folder: Path) -> pd.DataFrame:
 
 
 def _scaled(bounds: FloatArray, noise_px: float) -> FloatArray:
-    """Bounds at a noise level; unobservable quantities stay infinite, also without noise."""
+    """Scale bounds to a noise level; unobservable quantities stay infinite, also without noise."""
     known = np.isfinite(bounds)
     return np.where(known, noise_px * np.where(known, bounds, 0.0), np.inf)
 
 
 def score_trials(arrays: Arrays, solver: int, reference_point: str, cell: Cell) -> dict[str, FloatArray]:
-    """e_R_deg, e_T_deg and e_s (trials,) of one solver: see ``scoring.pose_errors``."""
+    """Return e_R_deg, e_T_deg and e_s (trials,) of one solver, see ``scoring.pose_errors``."""
     return pose_errors(
         arrays["w_est"][:, solver],
         arrays["d_est"][:, solver],
@@ -447,7 +447,7 @@ def score_trials(arrays: Arrays, solver: int, reference_point: str, cell: Cell) 
 
 
 def failure_reasons(arrays: Arrays, solver: int) -> str:
-    """Why trials of a solver failed, the most frequent reasons first: ``3 x took longer than 60 s``."""
+    """Return the reasons of a solver's failures, such as ``3 x took longer than 60 s``, most frequent first."""
     codes = arrays["reason_code"][~arrays["success"][:, solver], solver]
     counts = Counter(str(arrays["reasons"][code]) for code in codes)
     ranked = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
@@ -459,14 +459,14 @@ def failure_reasons(arrays: Arrays, solver: int) -> str:
 def summary_row(
     scores: dict[str, FloatArray], success: NDArray[np.bool_], limit: Arrays, seed: int
 ) -> dict[str, Any]:
-    """Statistics of one solver in one cell.
+    """Compute the statistics of one solver in one cell.
 
     Args:
         scores: see ``score_trials``.
-        success: (trials,).
+        success: (trials,) whether the solver succeeded.
         limit: bounds ``rotation`` (trials, 3) and ``direction`` (trials, 2) along their principal axes (radians),
             and ``scale`` (trials,), at the noise of the cell.
-        seed: of the bootstrap.
+        seed: seed of the bootstrap.
 
     Returns:
         Columns of summary.csv; errors that the data cannot determine are None, and ``unobservable`` names them.
@@ -507,11 +507,11 @@ _OVER_BOUND = ("rms", "bound", "over_bound", "over_bound_low", "over_bound_high"
 
 
 def at_bound(axes: FloatArray, seed: int) -> dict[str, float]:
-    """Median and mean of the errors of a solver with Gaussian errors at the bound: the bound of each statistic.
+    """Return the median and mean error of a solver with Gaussian errors at the bound, for comparison.
 
     Args:
         axes: standard deviations (trials, k) along the principal axes of the error, a vector of k numbers.
-        seed: of the draws, which leave 0.4 % of the mean of 300 trials open.
+        seed: seed of the random errors, whose sampling changes the mean of 300 trials by 0.4 %.
     """
     draws = generator(seed, "at bound", *axes.shape).standard_normal((_IDEAL_DRAWS, *axes.shape))
     errors = np.linalg.norm(axes * draws, axis=-1)
@@ -519,9 +519,9 @@ def at_bound(axes: FloatArray, seed: int) -> dict[str, float]:
 
 
 def over_bound(values: FloatArray, sigmas: FloatArray, seed: int) -> dict[str, float | None]:
-    """Root mean square of errors (n,), of their bounds (n,), and the quotient with its interval.
+    """Return the root mean square of errors (n,), that of their bounds (n,), and the quotient with its interval.
 
-    None where they do not exist.
+    Values that do not exist are None.
     """
     found: dict[str, float | None] = dict.fromkeys(_OVER_BOUND)
     if not len(values) or np.any(np.isnan(values)):
@@ -540,7 +540,7 @@ def _rms(values: FloatArray) -> FloatArray:
 
 
 def statistics(values: FloatArray, seed: int) -> dict[str, float | None]:
-    """Median and mean with their intervals, and the 90th percentile; None when a value does not exist."""
+    """Return median and mean with their intervals, and the 90th percentile; all None if any value is NaN."""
     names = ("median", "median_low", "median_high", "mean", "mean_low", "mean_high", "p90")
     if np.any(np.isnan(values)):
         return dict.fromkeys(names)
@@ -553,12 +553,12 @@ MEASURES = ("e_R_deg", "e_T_deg")
 
 
 def errors_of_rows(table: pd.DataFrame, folder: Path) -> dict[str, NDArray[np.float32]]:
-    """``MEASURES`` (rows, trials) of the rows of a summary, whose trials lie in the folder of its sweep.
+    """Return ``MEASURES``, each (rows, trials), for the rows of a summary, from the folder of its sweep.
 
     Failures have the worst value, as in the summary.
 
     Raises:
-        RsbenchError: the folder holds no sweep.
+        RsbenchError: the folder contains no sweep.
     """
     found: dict[tuple[object, ...], dict[str, NDArray[np.float32]]] = {}
     card, solvers = read_card(folder), read_sweep(folder)["solvers"]

@@ -64,16 +64,16 @@ class SimulationOptions:
     tracks: int = 0
     """Points seen in all four images."""
     lines: int = 0
-    """Straight lines seen in all four images, each by two ends that are other points of it in every image; a
-    rolling shutter reads each end at its row's time, and bends the line between them."""
+    """Straight lines seen in all four images. Each image shows two ends of a line, other points of it in every
+    image, each read at the time of its row; a rolling shutter bends the line between them."""
     noise_px: float = 0.0
     """Standard deviation of the noise on every pixel coordinate."""
     outlier_ratio: float = 0.0
-    """Share of outliers: matches in which some pixels are replaced."""
+    """Share of outliers: matches of which some pixels are displaced."""
     outlier_px: float = 80.0
-    """Largest distance, per coordinate, of outliers from the truth, uniform."""
+    """Largest displacement of outliers per coordinate; displacements are uniform."""
     outlier_images: OutlierImages = "frame 1"
-    """Displaced pixels: those of frame 1, alike in both cameras, or those of every image, each by its own draw."""
+    """Displaced pixels of an outlier: those of frame 1, equally in both cameras, or all, independently."""
     depth: tuple[float, float] = (2.0, 10.0)
     """Range of depths in frame 0, metres, uniform."""
     gyro_rate: int = 0
@@ -83,17 +83,17 @@ class SimulationOptions:
     gyro_bias_deg: float = 0.0
     """Length of the bias of all samples, in a random direction, degrees per frame period."""
     gyro_delay: float = 0.0
-    """Error of the samples' times, frame periods: above 0 they are stated too late."""
+    """Error of the samples' time stamps, frame periods; positive if the stamps are too late."""
     gravity: bool = False
-    """Whether the direction of gravity is given, at the start of either frame."""
+    """Whether the direction of gravity is given, at the start of each frame."""
     gravity_noise_deg: float = 0.0
     """Standard deviation of each of the two angles of the direction of gravity, degrees."""
     affine: bool = False
-    """Whether the left matches have affine frames: of patches of all slants up to 60 degrees, or of the plane."""
+    """Whether the left matches have affine frames, of patches with slants up to 60 degrees, or of the plane."""
     affine_noise: float = 0.0
     """Standard deviation of the noise on every number of an affine frame, as a share of the frame's size."""
     shape: SceneShape = "box"
-    """Points at random depths, or on one slanted plane in the middle of the range."""
+    """Whether points have random depths, or lie on one slanted plane in the middle of the range."""
 
     def __post_init__(self) -> None:
         for name in ("pairs", "tracks", "lines"):
@@ -122,30 +122,30 @@ class SimulationOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Simulation:
-    """Correspondences with their truth."""
+    """Simulated correspondences with their ground truth."""
 
     correspondences: Correspondences
     rig: StereoRig
     shutter: RollingShutter
     motion: Motion
     outliers: dict[str, np.ndarray]
-    """Per set (``left``, ``right``, ``tracks``, and ``lines`` where there are any), which matches are outliers."""
+    """Mask of the outliers, by set: ``left``, ``right``, ``tracks``, and ``lines`` if there are any."""
 
 
 def random_direction(rng: np.random.Generator) -> FloatArray:
-    """Unit vector (3,), uniform on the sphere."""
+    """Return a random unit vector (3,), uniform on the sphere."""
     v = rng.standard_normal(3)
     return unit(v)
 
 
 def unit(v: FloatArray) -> FloatArray:
-    """A vector (3,) scaled to length 1, without ``np.linalg.norm``, whose BLAS adds in another order on other
-    processors."""
+    """Return a vector (3,) scaled to length 1, without ``np.linalg.norm``, whose order of sums depends on the
+    processor."""
     return v / np.sqrt(np.sum(v * v))
 
 
 def random_motion(rng: np.random.Generator, angle: float, distance: float, model: str = "linear") -> Motion:
-    """Random motion that rotates by ``angle`` (radians) and translates by ``distance`` (metres) per frame
+    """Return a random motion that rotates by ``angle`` (radians) and translates by ``distance`` (metres) per frame
     period."""
     return make_motion(model, angle * random_direction(rng), distance * random_direction(rng))
 
@@ -157,14 +157,14 @@ def simulate(
     options: SimulationOptions,
     rng: np.random.Generator,
 ) -> Simulation:
-    """Matches of points that the moving rig sees in all images that their set needs.
+    """Simulate matches of points that the moving rig sees in all images of their set.
 
-    Equal generators give common random numbers: the candidates for points, the standardised noise and the
-    outliers are the same whatever the motion, the shutter, the rig and the size of the noise, and fewer matches
-    are the first of more. ``rng`` must be freshly made (it is spawned from).
+    Equal generators give common random numbers: candidate points, standardised noise and outliers do not depend on
+    motion, shutter, rig and noise level, and fewer matches are the first ones of a larger number. ``rng`` must be
+    new, because other generators are spawned from it.
 
     Raises:
-        ValueError: the motion leaves too few points in view.
+        ValueError: too few points are in view under the motion.
     """
     scenes, noises, wrongs = rng.spawn(3), rng.spawn(3), rng.spawn(3)
     counts = {"left": options.pairs, "right": options.pairs, "tracks": options.tracks}
@@ -193,7 +193,7 @@ def simulate(
 
 
 def _gyro(motion: Motion, options: SimulationOptions, rng: np.random.Generator) -> FloatArray:
-    """Samples (n, 4) from half a period before frame 0 to half a period after the last row of frame 1."""
+    """Return samples (n, 4), tau and w, for tau from -0.5 to 2.5 frame periods."""
     if options.gyro_rate == 0:
         return np.zeros((0, 4))
     tau = -0.5 + np.arange(3 * options.gyro_rate + 1) / options.gyro_rate
@@ -203,25 +203,25 @@ def _gyro(motion: Motion, options: SimulationOptions, rng: np.random.Generator) 
 
 
 def _gravity(motion: Motion, options: SimulationOptions, rng: np.random.Generator) -> FloatArray:
-    """(2, 4) directions of gravity of a tilted camera."""
+    """Return rows (2, 4), tau and the direction of gravity, for a tilted camera."""
     if not options.gravity:
         return np.zeros((0, 4))
     tau = np.array([0.0, 1.0])
     down = motion.body_from_world(tau).R @ _DOWN
     noise = np.deg2rad(options.gravity_noise_deg) * rng.standard_normal((2, 3))
-    across = noise - np.sum(noise * down, axis=1, keepdims=True) * down  # two angles: none about itself
+    across = noise - np.sum(noise * down, axis=1, keepdims=True) * down  # no rotation about gravity itself
     return np.column_stack([tau, (so3.exp(across) @ down[..., None])[..., 0]])
 
 
 def _slanted(rays: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Unit normals (n, 3) of patches that unit rays (n, 3) meet, slanted in all directions."""
+    """Return unit normals (n, 3) of patches on unit rays (n, 3), slanted in random directions."""
     slant, turn = rng.uniform(size=(2, len(rays))) * [[_MOST_SLANT], [2.0 * np.pi]]
     axis = np.sum(plane_basis(rays) * np.stack([np.cos(turn), np.sin(turn)], axis=1)[:, None], axis=2)
     return (so3.exp(slant[:, None] * axis) @ rays[..., None])[..., 0]
 
 
 def _displace(matches: FloatArray, options: SimulationOptions, rng: np.random.Generator) -> np.ndarray:
-    """Move pixels of some matches, in place; returns which."""
+    """Displace pixels of randomly chosen matches, in place; return the mask (n,) of these outliers."""
     draws = rng.uniform(-1.0, 1.0, (len(matches), 3))
     chosen = np.argsort(draws[:, 2], kind="stable")[: round(options.outlier_ratio * len(matches))]
     mask = np.zeros(len(matches), dtype=np.bool_)
@@ -235,13 +235,13 @@ def _displace(matches: FloatArray, options: SimulationOptions, rng: np.random.Ge
 
 
 _SLIDE = 0.2
-"""Largest difference of a line's ends between images, as a share of its length."""
+"""Largest shift of an end along its line in an image, as a share of the line's length."""
 _SECANT_STEPS = 12
 
 
 @dataclass(frozen=True, eq=False)
 class MovingRig:
-    """Everything that determines the images of a simulation, and the images without noise."""
+    """A rig, its motion and the options of a simulation, from which its images without noise are computed."""
 
     rig: StereoRig
     shutter: RollingShutter
@@ -251,7 +251,7 @@ class MovingRig:
     def matches(
         self, rng: np.random.Generator, count: int, sides: tuple[Side, ...]
     ) -> tuple[FloatArray, FloatArray]:
-        """Pixels (count, views, 2 frames, 2) of points (count, 3) that every view sees once."""
+        """Return pixels (count, views, 2 frames, 2), and their points (count, 3), which every view sees once."""
         rig, options = self.rig, self.options
         camera = rig.sensor(sides[0])
         found, places = [np.zeros((0, len(sides), 2, 2))], [np.zeros((0, 3))]
@@ -280,7 +280,7 @@ class MovingRig:
         return np.concatenate(found)[:count], np.concatenate(places)[:count]
 
     def lines(self, rng: np.random.Generator) -> FloatArray:
-        """Ends (lines, 16) of lines that all four images see."""
+        """Return the ends (lines, 16) of lines that all four images see."""
         count = self.options.lines
         found = [np.zeros((0, 16))]
         for _ in range(60):
@@ -293,7 +293,7 @@ class MovingRig:
             seen = list[FloatArray]()
             for k, (frame, side) in enumerate(product(FRAMES, SIDES)):
                 share = _SLIDE * draws[:, 6 + 2 * k : 8 + 2 * k]
-                # From either end towards the other.
+                # Shift each end towards the other one.
                 moved = ends + share[..., None] * (ends[:, ::-1] - ends)
                 seen += [self.seen_once(side, frame, moved[:, e], rows[:, e]) for e in (0, 1)]
             stacked = np.concatenate(seen, axis=1)
@@ -301,16 +301,16 @@ class MovingRig:
         raise ValueError(f"the motion leaves fewer than {count} lines in view; use a slower one")
 
     def _points(self, side: Side, draws: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels (n, 2) of a camera's frame 0 and points (n, 3) that it sees there, from uniform draws (n, 3)."""
+        """Return pixels (n, 2) of a camera's frame 0 and their points (n, 3), from uniform ``draws`` (n, 3)."""
         camera = self.rig.sensor(side)
         pixels = draws[:, :2] * (camera.width - 1, camera.height - 1)
         depth = _depths(self.options, draws[:, 2], camera.unproject(pixels))
         return pixels, back_project(self.rig, self.shutter, self.motion, side, 0, pixels, depth)
 
     def affine(self, pixels: FloatArray, points: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Affine frames (n, 4), noisy, of patches at points (n, 3) that the left camera sees at (n, 2 frames, 2).
+        """Return noisy affine frames (n, 4) of patches at points (n, 3) with left pixels (n, 2 frames, 2).
 
-        An outlier's is that of the point which it was.
+        An outlier has the affine frame of its match before displacement.
         """
         rig, shutter, motion, options = self.rig, self.shutter, self.motion, self.options
         if not options.affine or len(points) == 0:
@@ -331,10 +331,10 @@ class MovingRig:
         return A + options.affine_noise * size * rng.standard_normal(A.shape)
 
     def seen_once(self, side: Side, frame: int, points: FloatArray, guess: FloatArray) -> FloatArray:
-        """Pixels (n, 2) of points (n, 3) that one frame sees exactly once; NaN for the others.
+        """Return the pixels (n, 2) of points (n, 3) that one frame sees exactly once; NaN for the others.
 
-        The same as ``rs_project``, which searches all rows, but many times as fast for slow motion: where image
-        points are slower than the readout none can be seen twice, and secant steps from a near row suffice.
+        The result is that of ``rs_project``, which searches all rows, but slow motion takes far less time: an
+        image point that is slower than the readout cannot be seen twice, and secant steps from a near row suffice.
         """
         rig, shutter, motion = self.rig, self.shutter, self.motion
         pixels = np.full((len(points), 2), np.nan)
@@ -358,10 +358,10 @@ class MovingRig:
         return pixels
 
     def _slower_than_readout(self, side: Side, frame: int, points: FloatArray) -> NDArray[np.bool_]:
-        """Mask (n,) of points whose image provably never moves as fast as half the speed of the readout.
+        """Return the mask (n,) of points whose image provably moves at less than half the speed of the readout.
 
-        Then the row equation decreases at every zero, so it has at most one. If the motion has no bound of its
-        speed over the frame, the mask is False.
+        Then the row equation decreases at every zero, so it has at most one zero. If no bound of the motion's
+        speed is known, the mask is False.
         """
         rig, shutter, camera = self.rig, self.shutter, self.rig.camera
         none = np.zeros(len(points), dtype=np.bool_)
@@ -379,7 +379,7 @@ class MovingRig:
 
 
 def _depths(options: SimulationOptions, draws: FloatArray, rays: FloatArray) -> FloatArray:
-    """Depth z (n,) of the points on the rays (n, 3), from uniform draws (n,) in [0, 1)."""
+    """Return the depths z (n,) of points on rays (n, 3), from uniform random ``draws`` (n,) in [0, 1)."""
     near, far = options.depth
     if options.shape == "box":
         return near + (far - near) * draws

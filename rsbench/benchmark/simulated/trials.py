@@ -1,4 +1,4 @@
-"""Trials of one cell of a sweep: simulate, run every solver on the matches that it needs, and store its answers
+"""Trials of one cell of a sweep: simulate matches, run each solver on those that it uses, and return its answers
 with the truth."""
 
 from __future__ import annotations
@@ -88,18 +88,18 @@ def run_trials(
     robust: bool,
     runner: SolverRunner,
 ) -> Arrays:
-    """Trials ``first`` to ``first + count - 1`` of a setting.
+    """Run trials ``first`` to ``first + count - 1`` of a setting.
 
-    Scene, motion and noise of a trial depend only on its number and the seed, so that all solvers, values and
-    sweeps share them as far as their settings allow. Any error of another package's solver is a failed trial; an
-    exception of one of rsbench's solvers is raised.
+    The random numbers for scene, motion and noise of a trial depend only on its number and the seed, so that all
+    solvers, values and sweeps share them as far as their settings allow. An error of another package's solver is a
+    failure; an exception of one of rsbench's solvers is raised.
 
     Returns:
         ``w``, ``d`` (trials, 3), the truth; ``w_est``, ``d_est`` (trials, solvers, 3), ``success``, ``metric``,
             ``direction_known``, ``reason`` and ``seconds`` (trials, solvers).
 
     Raises:
-        RsbenchError: no such solver; the motion of the setting leaves too few points in view.
+        RsbenchError: a solver does not exist, or too few points are in view under the motion of the setting.
     """
     entrants = [enter(load_solver_entry(name)) for name in solvers]
     truth, seconds = list[tuple[FloatArray, FloatArray]](), list[list[float]]()
@@ -124,13 +124,13 @@ def run_trials(
 
 
 def run_bounds(setting: Setting, solvers: tuple[str, ...], seed: int, first: int, count: int) -> Arrays:
-    """Cramer-Rao bounds of trials for a noise of 1 px, without outliers.
+    """Compute Cramer-Rao bounds of trials for a noise of 1 px, without outliers.
 
     Returns:
         ``rotation`` (trials, solvers, 3), ``direction`` (trials, solvers, 2) and ``scale`` (trials, solvers):
-            least root mean square errors of an unbiased solver, along the principal axes of the rotation and of
-            the direction of d (radians), and of the length of d, for the matches that each solver gets; infinite
-            if these do not determine it.
+            smallest root mean square errors of an unbiased solver, along the principal axes of the rotation and
+            of the direction of d (radians), and of the length of d (relative), for the matches that each solver
+            gets; infinite if these do not determine the value.
     """
     entrants = [enter(load_solver_entry(name)) for name in solvers]
     rows = []
@@ -181,7 +181,7 @@ def _timed(
     robust: bool,
     runner: SolverRunner,
 ) -> tuple[MotionEstimate, float]:
-    """An answer and its processor time, which does not include other processes, as solvers have one thread."""
+    """Run a solver; return its answer and its processor time, seconds, which excludes other processes."""
     matches, rig, shutter = given_matches(simulation, e.information), setting.rig(), setting.given_shutter()
     sensed = {name: getattr(simulation.correspondences, name) for name in BESIDE if name in e.solver.spec.needs}
     matches = replace(matches, **sensed)

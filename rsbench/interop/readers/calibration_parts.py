@@ -310,7 +310,7 @@ class Files(NamedTuple):
 class Format(NamedTuple):
     name: str
     holds: Callable[[Any], bool]
-    """Whether the content of a file is of this format."""
+    """Function that returns whether the content of a file is of this format."""
     read: Callable[[Files], Calibration]
     parts: Callable[[Path, Mapping[Path, Any]], Mapping[Path, Any]] | None = None
     """Function that selects the files that belong together with a file; None if one file is sufficient."""

@@ -3,16 +3,16 @@
 A reader returns the tables of rig.toml: ``left``, ``right`` and ``X_right = R X_left + t`` in metres. Conventions
 of the tools, from their documentation and sources:
 
-**Kalibr** (camchain.yaml, camchain-imucam.yaml; OpenVINS has the same keys): ``T_cn_cnm1`` takes the previous
-camera's coordinates to this one's; ``T_cam_imu`` those of the IMU to the camera's, OpenVINS's ``T_imu_cam`` the
-reverse. A camera's time plus ``timeshift_cam_imu`` is the IMU's time; no other format here has a ``line_delay``,
-which is the readout.
+**Kalibr** (camchain.yaml, camchain-imucam.yaml; OpenVINS has the same keys): ``T_cn_cnm1`` maps coordinates of the
+previous camera to this one, ``T_cam_imu`` those of the IMU to the camera, and OpenVINS's ``T_imu_cam`` those of
+the camera to the IMU. A camera's time plus ``timeshift_cam_imu`` is the IMU's time. ``line_delay`` is the time
+between rows; no other format here has one.
 
-**Basalt**: ``T_imu_cam`` takes a camera's coordinates to the IMU's. **ZED** (SN*.conf): millimetres, a rotation
-vector (RX, CV, RZ), T = (-Baseline, TY, TZ), sections by the size of the images. **DepthAI**: centimetres, x_to =
-R x_this + t along a chain of sockets. **RealSense** has no file of its own: JSON of rs2_intrinsics and
-rs2_extrinsics, whose matrices run down the columns. **COLMAP** (rig_config.json; cameras.txt and rigs.txt): pixels
-from the corner, half a pixel more than here; x_camera = R x_rig + t.
+**Basalt**: ``T_imu_cam`` maps camera coordinates to the IMU. **ZED** (SN*.conf): millimetres, a rotation vector
+(RX, CV, RZ), T = (-Baseline, TY, TZ), a section for each image size. **DepthAI**: centimetres, x_to = R x_this + t
+along a chain of sockets. **RealSense** has no file format of its own: JSON of rs2_intrinsics and rs2_extrinsics,
+whose matrices are stored by columns. **COLMAP** (rig_config.json; cameras.txt and rigs.txt): the origin of pixel
+coordinates is the corner of the image, so they are half a pixel larger than here; x_camera = R x_rig + t.
 """
 
 from __future__ import annotations
@@ -70,14 +70,14 @@ _RIG_CONFIG = "COLMAP rig_config.json"
 
 
 def read_calibration(path: Path, given: Assumptions | None = None) -> Calibration:
-    """The calibration that a file or folder holds.
+    """Read the calibration in a file or folder.
 
     Args:
-        path: a file of one of the formats, or a folder with one or with the files that belong together.
-        given: what the user states in addition to the file.
+        path: a file of one of the formats, or a folder with such a file or with files that belong together.
+        given: assumptions of the user, in addition to the file.
 
     Raises:
-        RsbenchError: one line with the file, the field, what is wrong and the remedy.
+        RsbenchError: the calibration is missing or invalid; the message names file, field, fault and remedy.
     """
     given = given or Assumptions()
     if path.is_dir():
@@ -102,14 +102,14 @@ def read_calibration(path: Path, given: Assumptions | None = None) -> Calibratio
 
 
 def _trees_in(*folders: Path) -> Iterator[tuple[Path, Any]]:
-    """Files of folders and their contents; those that cannot be read are skipped."""
+    """Yield the files of folders and their parsed contents; files that cannot be read are skipped."""
     for path in (path for folder in folders for path in files_in(folder)):
         with contextlib.suppress(RsbenchError):
             yield path, read_tree(path)
 
 
 def _by_format(files: Iterable[tuple[Path, Any]]) -> dict[Format, dict[Path, Any]]:
-    """The calibrations among files by their formats, in the order of ``FORMATS``."""
+    """Return the calibrations among files by format, in the order of ``FORMATS``; other files are left out."""
     found = {kind: dict[Path, Any]() for kind in FORMATS}
     for path, tree in files:
         kind = next((kind for kind in FORMATS if kind.holds(tree)), None)
@@ -119,9 +119,9 @@ def _by_format(files: Iterable[tuple[Path, Any]]) -> dict[Format, dict[Path, Any
 
 
 def _of_folder(folder: Path) -> tuple[Format, Mapping[Path, Any]]:
-    """The only format in a folder, and its files; RsbenchError if there is none or more than one."""
+    """Return the only format in a folder, and its files; RsbenchError if there is none or more than one."""
     found = _by_format(_trees_in(folder))
-    if _RIG_CONFIG in (kind.name for kind in found):  # cameras.txt beside it is a part
+    if _RIG_CONFIG in (kind.name for kind in found):  # cameras.txt in the folder belongs to it
         found = {kind: trees for kind, trees in found.items() if kind.name != "COLMAP"}
     if len(found) != 1:
         listed = "; ".join(f"{next(iter(trees)).name} of {kind.name}" for kind, trees in found.items())
@@ -130,7 +130,7 @@ def _of_folder(folder: Path) -> tuple[Format, Mapping[Path, Any]]:
 
 
 def _left_first(found: Calibration, given: Assumptions, where: str) -> Calibration:
-    """The calibration with the left camera first and the transform from left to right."""
+    """Return the calibration with the left camera first and the transform from left to right."""
     if found.right_from_left is None:
         return found
     apart = inverse(found.right_from_left) if given.invert else found.right_from_left
@@ -193,14 +193,14 @@ def _read_kalibr(files: Files) -> Calibration:
 
 
 def _kalibr_apart(first: Fields, second: Fields) -> Pose:
-    """The second camera's transform from the first one's."""
+    """Return the transform from the first camera to the second."""
     if "T_cn_cnm1" in second:
         return pose_of(second, "T_cn_cnm1")
     return compose(_kalibr_from_imu(second), inverse(_kalibr_from_imu(first)))
 
 
 def _kalibr_from_imu(camera: Fields) -> Pose:
-    """``camera_from_imu``."""
+    """Return ``camera_from_imu``."""
     if "T_cam_imu" in camera:
         return pose_of(camera, "T_cam_imu")
     if "T_imu_cam" in camera:
@@ -212,10 +212,10 @@ def _kalibr_from_imu(camera: Fields) -> Pose:
 
 
 def kalibr_in_body(path: Path) -> list[tuple[Table, Pose]]:
-    """Table and ``body_from_camera`` of each camera of a camchain that has the IMU, whose axes are the body's.
+    """Read the table and ``body_from_camera`` of each camera of a camchain with an IMU, whose axes are the body's.
 
     Raises:
-        RsbenchError: it is not a camchain, or a camera has no pose.
+        RsbenchError: the file is not a camchain, or a camera has no pose.
     """
     top, found = Fields(read_tree(path), str(path)), list[tuple[Table, Pose]]()
     if not _is_kalibr(top.tree):
@@ -405,7 +405,7 @@ def _read_depthai(files: Files) -> Calibration:
 
 
 def _depthai_unit(apart: Fields) -> float:
-    """Metres; centimetres where the file does not say."""
+    """Return the unit of length in metres; it is centimetres if the file has none."""
     known = {"0": 1.0, "1": 0.01, "2": 0.001, "3": 0.0254, "4": 0.3048}
     unit = known.get(apart.text("lengthUnit", default="1"))
     if unit is None:
@@ -416,7 +416,7 @@ def _depthai_unit(apart: Fields) -> float:
 
 
 def _chained(links: Mapping[tuple[int, int], Pose], start: int, end: int, where: str) -> Pose:
-    """The transform from one camera to another along links between cameras."""
+    """Return the transform from camera ``start`` to camera ``end`` along links between cameras."""
     known = {start: Pose(np.eye(3), np.zeros(3))}
     todo = [start]
     while todo:
@@ -443,7 +443,7 @@ def _depthai_camera(camera: Fields) -> Table:
 
 
 def _tables_with(keys: Sequence[str], tree: Any, name: str = "") -> dict[str, Mapping[str, Any]]:
-    """Inner tables that have all keys, each by the keys that lead to it, in lower case and joined by blanks."""
+    """Return the nested tables that have all ``keys``, named by the path of keys to them, in lower case."""
     if not isinstance(tree, Mapping):
         return {}
     if keyed(tree, *keys):
@@ -525,7 +525,7 @@ _COLMAP_MODELS: Mapping[str, tuple[str, str]] = {
 def colmap_camera(
     name: str, params: Sequence[Any], size: Sequence[float] | FloatArray | None, where: str
 ) -> tuple[Table, str]:
-    """Camera table from the model's name and parameters, and a note if the lens was fitted, otherwise \"\"."""
+    """Return the camera table for a model's name and parameters, and a note if the lens was fitted, else \"\"."""
     if name not in _COLMAP_MODELS:
         raise RsbenchError(f"{where}: camera model {name!r}: must be one of {', '.join(_COLMAP_MODELS)}")
     keys, model = _COLMAP_MODELS[name]
@@ -537,7 +537,7 @@ def colmap_camera(
 
 
 def colmap_poses(words: Sequence[str], where: str) -> dict[str, Pose]:
-    """``camera_from_rig`` by the camera's number, from the words of a line of rigs.txt; its reference first."""
+    """Return ``camera_from_rig`` by camera number from the words of a line of rigs.txt, reference camera first."""
     poses = {words[3]: Pose(np.eye(3), np.zeros(3))} if words[2:3] == ["CAMERA"] and len(words) > 3 else {}
     rest = words[4:]
     while len(rest) >= 3:
@@ -596,7 +596,7 @@ def _colmap_pair(tables: list[Table], poses: list[Pose], notes: list[str], given
 
 
 def _colmap_cameras(lines: Iterable[list[str]], where: str) -> dict[str, tuple[Table, str]]:
-    """Cameras of cameras.txt by their numbers, each with a note if it is approximate."""
+    """Return the tables of cameras.txt by camera number, each with a note if it is approximate, or \"\"."""
     made = dict[str, tuple[Table, str]]()
     for words in lines:
         if len(words) > 4 and words[1].isupper() and words[2] not in ("CAMERA", "IMU"):
@@ -607,7 +607,7 @@ def _colmap_cameras(lines: Iterable[list[str]], where: str) -> dict[str, tuple[T
 
 
 def _read_colmap(files: Files) -> Calibration:
-    """cameras.txt, with rigs.txt where there are two cameras."""
+    """Read cameras.txt and, if there are two cameras, rigs.txt."""
     lines = [line for tree in files.trees.values() for line in tree["colmap"]]
     made = _colmap_cameras(lines, files.where)
     rigs = [words for words in lines if words[2:3] in (["CAMERA"], ["IMU"])]
@@ -643,7 +643,7 @@ def _read_asl(files: Files) -> Calibration:
 
 
 def asl_camera(camera: Fields) -> Table:
-    """Table of the camera of a sensor.yaml."""
+    """Return the camera table of a sensor.yaml."""
     kind = camera.text("distortion_model", default="none")
     values = camera.numbers("distortion_coefficients").tolist() if kind != "none" else []
     lens = by_name(kind, values, camera.where)
@@ -651,7 +651,7 @@ def asl_camera(camera: Fields) -> Table:
 
 
 def asl_pose(camera: Fields) -> Pose:
-    """``body_from_camera``."""
+    """Return ``body_from_camera`` of a sensor.yaml."""
     value = camera.get("T_BS")
     T = np.ravel(value["data"] if isinstance(value, Mapping) else value)
     return pose_of(Fields({"T_BS": T}, camera.where), "T_BS")
@@ -675,4 +675,4 @@ FORMATS: tuple[Format, ...] = (
 )
 """Supported formats, in the order in which a file is tested."""
 _NUMBERED = ("Kalibr", "Basalt", "COLMAP", "EuRoC")
-"""Formats that number their cameras, so that the first need not be the left one."""
+"""Formats with numbered cameras, of which the first need not be the left one."""

@@ -29,7 +29,7 @@ from rsbench.pipeline.footage import read_frame
 from rsbench.vision.features import Features, Gate, detect, match
 
 _ROWS = 30
-"""Iterations to find the row that sees a point; each multiplies the error by readout ratio times image speed."""
+"""Iterations to find the row of a point; each multiplies the error by readout ratio times image speed."""
 _TOLERANCE = 0.01
 """Tolerance of the relative depth difference: depth is interpolated, and text has four decimals."""
 _TYPICAL = 2e-3

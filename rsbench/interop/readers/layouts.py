@@ -19,11 +19,11 @@ published separately, and its times are assumed to be those of the first row.
 // 2``, ``%04d_mask.png`` the pixels that the authors score. The rest follows from its generator (UnrealCV of the
 same authors, Python/capture_rolling_shutter.py):
 
-- exp([w t]x), v t is the pose of the camera at time t **in the camera at time 0**: ``cam_from_world`` is its
-  inverse, rotation and translation grow apart (no screw), and the translation is turned by the rotation;
+- rotation exp([w t]x) and translation v t are the pose of the camera at time t **in the camera at time 0**:
+  ``cam_from_world`` is its inverse, with the translation -exp(-[w t]x) v t, and the motion is not a screw;
 - row r of frame k is read at k / FPS + r times the row's readout, which is 1 / FPS / rows: a readout ratio of 1;
-- the field of view is 90 degrees: fx is half the width, and the principal point the middle of the image, which is
-  (width - 1) / 2 here and width / 2 in their own code;
+- the field of view is 90 degrees: fx is half the width, and the principal point is the middle of the image, which
+  is (width - 1) / 2 here and width / 2 in their own code;
 - ``.depth`` is the distance along the ray, ``.pdepth`` is z, computed from it with their principal point.
 
 **Fastec-RS** (the same paper): a sequence is a folder with ``%03d_rolling.png``, ``%03d_global_first.png``, taken
@@ -42,8 +42,8 @@ Neither Middlebury nor KITTI has times of rows, and no shutter is assumed.
 
 **KITTI raw** (Geiger et al., Vision meets Robotics, IJRR 2013): a drive holds ``image_02/data`` and
 ``image_03/data`` (or 00 and 01, grey) with ``timestamps.txt``, and the day's folder ``calib_cam_to_cam.txt``. The
-images of an ``extract`` drive are as the cameras saw them, of the size ``S_0k``: ``K_0k``, ``D_0k`` (OpenCV's k1,
-k2, p1, p2, k3), and ``R_0k``, ``T_0k`` from camera 0 to camera k. Those of a ``sync`` drive are rectified, of the
+images of an ``extract`` drive are not rectified and have the size ``S_0k``: ``K_0k``, ``D_0k`` (OpenCV's k1, k2,
+p1, p2, k3), and ``R_0k``, ``T_0k`` from camera 0 to camera k. Those of a ``sync`` drive are rectified and have the
 size ``S_rect_0k``: ``P_rect_0k = K [I | t]``, t from the rectified camera 0. The cameras have global shutters.
 """
 
@@ -167,14 +167,15 @@ class Shot(NamedTuple):
 
 
 def read_colmap(folder: Path, images: Path | None = None) -> list[Recording]:
-    """One recording of each rig of two cameras and of each other camera, images in the order of their names.
+    """Read a recording for each rig of two cameras, and for each other camera; images are in the order of names.
 
     Args:
-        folder: holds cameras.txt and images.txt.
-        images: folder to which image names are relative; None: ``images`` in folder, or one or two levels above.
+        folder: folder with cameras.txt and images.txt.
+        images: folder to which image names are relative; by default ``images`` in ``folder``, or one or two levels
+            above, or else ``folder``.
 
     Raises:
-        RsbenchError: a file is missing or wrong, or a camera model has no counterpart.
+        RsbenchError: a file is missing or malformed, or a camera model is not supported.
     """
     cameras = dict(_colmap_camera(where, line) for where, line in lines(only_file(folder, "cameras.txt")))
     root = images or next(
@@ -347,7 +348,7 @@ def read_euroc(folder: Path, line_delays_s: Mapping[Side, float] | None = None) 
         line_delays_s: seconds between rows, 0 for a global shutter; if None, from the calibration.
 
     Raises:
-        RsbenchError: files that are missing or malformed.
+        RsbenchError: a file is missing or malformed.
     """
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     sensors = {side: root / f"cam{k}" for k, side in enumerate(SIDES) if (root / f"cam{k}").is_dir()}

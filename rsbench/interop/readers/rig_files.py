@@ -64,7 +64,7 @@ def read_rig_file(
         frame_size: gives the (width, height) of the frames, by which some formats choose a section.
 
     Raises:
-        RsbenchError: one line with the file, the field, what is wrong and the remedy.
+        RsbenchError: the file is missing or invalid; the message names file, field, fault and remedy.
     """
     readout, path = readout or Readout(), rig_path(path)
     if path.suffix == ".toml":
