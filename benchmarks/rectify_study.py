@@ -300,10 +300,10 @@ Made by `python benchmarks/rectify_study.py --out results/rectify`; versions, da
 ## Points
 
 {tracks} points seen by both cameras at both times, {noise} px of noise, no wrong matches; solver
-`rs-stereo-refined`; degrees, medians [and worst] of {seeds} scenes and motions. Rectified, e_T is about
-**{share:.2f} deg per degree of misalignment and unit of readout ratio** (95 % below {largest:.2f}), e_R
+`rs-stereo-refined`; degrees, medians [and worst] of {seeds} scenes and motions. Rectified, from 0.5 deg on, e_T
+is **{share:.3f} deg per degree of misalignment and unit of readout ratio** (95 % below {largest:.2f}), e_R
 {turn:.4f} deg per degree, unit of readout ratio and unit of speed. e_T does not fall with the speed, as it
-does where noise is the cause: the error of a pixel grows with the motion. More matches do not help either.
+does where noise is the cause: the error of a pixel grows with the motion.
 
 {points}
 """

@@ -29,12 +29,12 @@ REPOSITORY = "https://github.com/rsbench/rsbench/blob/main"
 HEAD = """# Solvers
 
 A solver estimates the motion of the rig, rotation vector w and translation d over one frame period, from
-matches. `rsbench list solvers` names those of this page; `--solver NAME` of `solve`, `correct`, `evaluate`
-and `simulate` takes one. [One page has a section for each](../reference/solver-sheets.md), with its paper,
+matches. `rsbench list solvers` lists the solvers of this page; `--solver NAME` of `solve`, `correct`, `evaluate`
+and `simulate` selects one. [One page has a section for each](../reference/solver-sheets.md), with its paper,
 equations, needs and assumptions. See also [Add a solver](../how-to/add-a-solver.md) and
 [Motion from one camera](monocular.md).
 
-## Which one to take
+## Which solver to use
 
 {uses}
 
@@ -44,21 +44,21 @@ The table comes from `python benchmarks/solver_pages.py`, from
 [measurements]({repository}/results/solvers/solvers.csv) by `python benchmarks/solver_measurements.py` on
 {date}, on one core of a busy {cores}-core machine ({processor}). The rig has two cameras of 900 x 900 px,
 f = 810 px, baseline 0.6 m and readout ratio 0.8. It moves by 2 deg and 0.3 m per frame period in random
-directions; points are 2 to 10 m away. The 95 % interval of a share of 1.00 begins at {ten:.2f} with 10 trials
-and at {twenty:.2f} with 20.
+directions; points are 2 to 10 m away. The 95 % interval of a share of 1.00 in {trials} trials begins at
+{least:.2f}.
 
 - **Bias**: median error on 100 exact matches per camera that follow the motion model of the solver. Its order,
   in the sections, is the factor by which half the motion reduces it: about 2 is first order, 4 second. A solver
   that assumes a global shutter sees rolling-shutter matches here.
-- **Noise**: root mean square error with {noise} px of noise over the Cramer-Rao bound of what the solver is
-  given; 1 is best. The error includes the bias, and one failure, which counts as 180 deg, dominates it. The
+- **Noise**: root mean square error with {noise} px of noise over the Cramer-Rao bound for the solver's input;
+  1 is best. The error includes the bias, and one failure, which counts as 180 deg, dominates it. The
   bound has six unknowns: velocities or an acceleration that a solver leaves free increase its factor. Gyroscope,
   gravity and affine frames are exact here; the bound includes the first two, but not the frames.
 - **Success**: share of robust estimates within {e_R} deg and {e_T} deg, at 0, 30 and 50 % outliers and at most
-  1000 samples; then at 50 % with at most {few} samples, and with as many as take about {ms:.0f} ms. "Alone"
-  means that the solver has a robust loop of its own, to which numbers of samples do not apply.
-- **ms**: processor time of a robust estimate from 200 matches with 30 % outliers. One robust estimate by each
-  of the {solvers} solvers, of {many} matches per camera with 30 % outliers, takes {all_s:.0f} s together.
+  1000 samples; then at 50 % with at most {few} samples, and with as many as take about {ms:.0f} ms. "Own
+  loop": the solver rejects outliers itself, with its own number of samples.
+- **ms**: processor time of a robust estimate from 200 matches with 30 % outliers. All {solvers} solvers together
+  take {all_s:.0f} s for one robust estimate each, from {many} matches per camera with 30 % outliers.
 
 Solvers of the left camera are scored on that camera's own motion. Other settings:
 [sweeps over noise, motion and scene]({repository}/results/sweeps/README.md).
@@ -107,14 +107,15 @@ def pages(folder: Path) -> dict[Path, str]:
     equations = tomllib.loads(Path(__file__).with_name("solver_equations.toml").read_text("utf-8"))
     table = pd.read_csv(folder / "solvers.csv")
     table = table[table["solver"].isin(list_cards("solvers"))]  # none under a former name
+    (trials,) = table["trials"].unique().tolist()
     told = dict(
         uses="\n".join(_use(*row) for row in USES),
         repository=REPOSITORY,
         date=made["date"],
         cores=machine["cores"],
         processor=machine["processor"],
-        ten=share_interval(10, 10).low,
-        twenty=share_interval(20, 20).low,
+        trials=trials,
+        least=share_interval(trials, trials).low,
         noise=given["noise_px"],
         e_R=given["good_deg"][0],
         e_T=given["good_deg"][1],
@@ -164,7 +165,7 @@ def overview(rows: Mapping[str, Mapping[Any, Any]]) -> list[str]:
             ", ".join(_degrees(row[f"bias_{error}_deg"]) for error in ("e_R", "e_T")),
             ", ".join(_short_factor(row, error) for error in ("e_R", "e_T")),
             *(_share(row[f"success_{each}"]) for each in OUTLIERS),
-            _share(row["success_few"]) if np.isfinite(row["sample_ms"]) else "alone",
+            _share(row["success_few"]) if np.isfinite(row["sample_ms"]) else "own loop",
             _share(row["success_quick"]),
             _number(row["robust_ms_30%"]),
         ]
@@ -246,7 +247,7 @@ def _failures(row: Mapping[Any, Any]) -> str:
 
 
 def _sample(ms: float) -> str:
-    return f"{_number(ms)} ms a sample" if np.isfinite(ms) else "alone"
+    return f"{_number(ms)} ms a sample" if np.isfinite(ms) else "own loop"
 
 
 def _share(value: float) -> str:

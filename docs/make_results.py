@@ -107,7 +107,7 @@ def marked(cells: Cells | None, column: str) -> str:
     """The cell of a score, bold where the data do not exclude that no method with as much input is better."""
     if cells is None:
         return "-"
-    bold = "**" if re.match(r"\d+ \[1, ", cells["rank"]) else ""
+    bold = "**" if re.match(r"\d+ \[1, |alone$", cells["rank"]) else ""
     return f"{bold}{cells[column]}{bold}"
 
 

@@ -7,6 +7,8 @@ estimated with the spline by maximum likelihood; the prior's variances, the knot
 
 from __future__ import annotations
 
+import functools
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -213,15 +215,20 @@ def _add_in_threads(
         return add_tracks(curve, tracks.ends, starts, *same, trust, *out, by_ratio, want)
     squares, band, gradient, shared = out
     later = np.zeros_like(band), np.zeros_like(gradient), Border(*map(np.zeros_like, shared))
-    with ThreadPoolExecutor(1) as pool:
-        half = curve, tracks.ends, starts[middle:], *same, trust[middle:], squares[middle:]
-        other = pool.submit(add_tracks, *half, *later, by_ratio, want)
-        half = trust[:middle], squares[:middle], band, gradient, shared, by_ratio, want
-        cost = add_tracks(curve, tracks.ends, starts[: middle + 1], *same, *half)
+    half = curve, tracks.ends, starts[middle:], *same, trust[middle:], squares[middle:]
+    other = _pool(os.getpid()).submit(add_tracks, *half, *later, by_ratio, want)
+    half = trust[:middle], squares[:middle], band, gradient, shared, by_ratio, want
+    cost = add_tracks(curve, tracks.ends, starts[: middle + 1], *same, *half)
     cost += other.result()
     for whole, part in zip((band, gradient, *shared), (*later[:2], *later[2]), strict=True):
         whole += part
     return cost
+
+
+@functools.cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Threads of a process that wait for work, as starting one takes as long as a tenth of the equations."""
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix=f"tracks-{process}")
 
 
 def _add_past(
@@ -530,10 +537,10 @@ def first_curve_of_camera(
 
     def fitted(curve: Curve, steps: int, first: int = 0, last: int = count) -> _Place:
         """The fit to the windows from ``first`` to before ``last``."""
-        counts = np.ones(len(tracks))
+        inside = np.ones(len(tracks), dtype=np.bool_)
         for own in (*tracks.members[:first], *tracks.members[last:]):
-            counts[own] = 0.0
-        descent = Descent(tracks, _TRIED_TAILS, prior, counts)
+            inside[own] = False
+        descent = Descent(tracks.only(inside), _TRIED_TAILS, prior, np.ones(np.count_nonzero(inside)))
         return descend(descent, descent.place(curve, None), steps, DAMPING)
 
     def extended(first: int) -> _Place:

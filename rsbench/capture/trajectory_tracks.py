@@ -587,6 +587,18 @@ class TimedTracks:
             by_ratio = np.hstack([by_ratio[:, :1], factors * by_ratio[:, 1:]])
         return replace(self, ends=ends, by_ratio=by_ratio)
 
+    def only(self, chosen: BoolArray) -> TimedTracks:
+        """The tracks that a mask (n,) selects, without ``members``."""
+        lengths = np.diff(self.starts)
+        seen = np.repeat(chosen, lengths)
+        return replace(
+            self,
+            ends=self.ends[seen],
+            starts=np.concatenate([[0], np.cumsum(lengths[chosen])]),
+            members=(),
+            by_ratio=None if self.by_ratio is None else self.by_ratio[seen],
+        )
+
     @cached_property
     def span(self) -> tuple[FloatArray, FloatArray]:
         """Times (n,) of the earliest and the latest observation of each track."""

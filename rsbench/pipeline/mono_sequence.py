@@ -48,11 +48,13 @@ from rsbench.pipeline.mono_correction import (
 from rsbench.pipeline.mono_gyro import NOT_COVERED, around, rotation_alone, with_gyro
 from rsbench.pipeline.sequence_capture import CorrectedMoment
 from rsbench.vision.corrector import load_corrector
-from rsbench.vision.images import grey_u8, map_ahead
+from rsbench.vision.images import ahead, grey_u8, map_ahead
 from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOptions, find_flows
 
 _AT_ONCE = 2
 """Number of pairs that are processed in parallel; parts of a pair's work use two cores by themselves."""
+_MOTIONS_AHEAD = 10
+"""Number of pairs with a motion that wait to be drawn: a group, so that the next trajectory is fitted meanwhile."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -201,7 +203,7 @@ def _pairs(
     seen = kept(map_ahead(look, pairs, _AT_ONCE, _AT_ONCE))
     rig = StereoRig.of_one(turn.camera)
     paths = (None for _ in seen) if gyro is not None else shared_trajectory(seen, rig, turn.shutter, begin, first)
-    for each, pair in map_ahead(ready, in_order(paths), _AT_ONCE, _AT_ONCE):
+    for each, pair in map_ahead(ready, ahead(in_order(paths), _MOTIONS_AHEAD), _AT_ONCE, _AT_ONCE):
         yield each.number + 1, *each.images, pair
 
 
@@ -351,7 +353,7 @@ def expected_errors(
         ((np.arange(n) + 0.5) * s).astype(np.intp) for n, s in zip((width, height), flows.scale, strict=True)
     )
     away = (drawn[np.ix_(rows, columns)][..., :2] - np.stack(np.meshgrid(columns, rows), axis=-1)) / flows.scale
-    ahead, good = ((line - rows) / lines)[:, None], np.ones(grey.shape, dtype=np.bool_)
+    later, good = ((line - rows) / lines)[:, None], np.ones(grey.shape, dtype=np.bool_)
     ends = list[tuple[Any, Any]]()
     for fusion, place in seen:  # times in readouts, which pairs of different lengths share
         flow, period = fusion.flows.flow[place], (1.0 - 2.0 * place) / fusion.own.shutter.readout_ratio
@@ -359,10 +361,10 @@ def expected_errors(
         good &= fusion.flows.returns[place] < _CONSISTENT_PX
     (a, to_first), (b, to_last) = ends[0], ends[-1]
     if len(ends) == 1:
-        moved = (ahead / a)[..., None] * to_first
+        moved = (later / a)[..., None] * to_first
     else:
-        moved = (ahead * (ahead - b) / (a * (a - b)))[..., None] * to_first
-        moved = moved + (ahead * (ahead - a) / (b * (b - a)))[..., None] * to_last
+        moved = (later * (later - b) / (a * (a - b)))[..., None] * to_first
+        moved = moved + (later * (later - a) / (b * (b - a)))[..., None] * to_last
     slopes = [cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, scale=0.125) for dx in (1, 0)]
     errors = []
     for off in (away - moved, moved):

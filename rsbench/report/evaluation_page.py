@@ -200,10 +200,12 @@ def _pose_table(out: Path) -> SummaryTable:
         f"{about}e_R and e_T against the true motion of the rig over one frame period (a monocular solver against "
         "the translation of its own camera); e_s = |log(estimated length / true length)| where a solver claims "
         "metres. A failure scores 180 degrees. 'Data' is the motion model that the data follow, 'assumes' that of "
-        "the solver. Inliers are among the matches that the solver works on, each counted once. All solvers ran "
-        "in the same robust loop on the same matches, of which each takes the sets that it can use."
+        "the solver, none for a global shutter. Inliers are among the matches that the solver works on, each "
+        "counted once. All solvers ran in the same robust loop on the same matches, of which each takes the sets "
+        "that it can use."
     )
     frame = frame.rename(columns=words)
+    frame["assumes"] = frame["assumes"].where(frame["shutter"] != "global", "none")
     counts = [name for name in ("runs", "failures") if name in frame]
     brief = frame[["sequence", "solver", "assumes", *headings.values(), "inliers", "matches", *counts]]
     told_first = frame[[*brief, *[name for name in frame if name not in brief]]]
