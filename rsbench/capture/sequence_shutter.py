@@ -10,7 +10,10 @@ every frame. The ratio has a uniform prior, so its posterior is proportional to 
 from __future__ import annotations
 
 import copy
+import itertools
+import os
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from functools import partial
@@ -73,7 +76,7 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import shared_error_factor, spread_about, tempered, tiles, variance_factor
 from rsbench.solvers.engine.levenberg_marquardt import descend
 
-_Start = TypeVar("_Start")
+_Start, _Item, _Result = TypeVar("_Start"), TypeVar("_Item"), TypeVar("_Result")
 LONGEST = 12
 """Most successive windows that are used; further ones would hardly reduce the error."""
 SUCCESSIVE = 6
@@ -365,11 +368,19 @@ class _Found(NamedTuple):
 
 def _likeliest(step: Callable[[_Start], _Found], starts: Iterable[_Start], count: int) -> list[_Found]:
     """The results of a step of the search with the largest evidence, at most ``count``."""
-    found = list[_Found]()
-    for start in starts:
+
+    def found(start: _Start) -> list[_Found]:
         with suppress(NotDefiniteError):
-            found.append(step(start))
-    return sorted(found, key=lambda each: -each.evidence)[:count]
+            return [step(start)]
+        return []
+
+    every = itertools.chain.from_iterable(_in_threads(found, starts))
+    return sorted(every, key=lambda each: -each.evidence)[:count]
+
+
+def _in_threads(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(work, items))
 
 
 class _Point(NamedTuple):
@@ -622,15 +633,13 @@ class _Profile:
         for _ in range(_STEPS):
             best = best._replace(place=best.place.inside(reach))
             follows, steps = self.follows(best), np.diag(reach)
-            here = self.beside(best, follows, np.zeros(2)).evidence
-            ahead, behind = (
-                np.array([self.beside(best, follows, sign * steps[k]).evidence for k in range(axes)])
-                for sign in (1.0, -1.0)
-            )
+            near = [np.zeros(2), *steps[:axes], *-steps[:axes], *([steps[0] + steps[1]] if axes > 1 else [])]
+            places = _in_threads(partial(self.beside, best, follows), near)
+            here, *others = (each.evidence for each in places)
+            ahead, behind = np.array(others[:axes]), np.array(others[axes : 2 * axes])
             H = np.diag(2.0 * here - ahead - behind)
             if axes > 1:
-                both = self.beside(best, follows, steps[0] + steps[1]).evidence
-                H[0, 1] = H[1, 0] = ahead[0] + ahead[1] - here - both
+                H[0, 1] = H[1, 0] = ahead[0] + ahead[1] - here - others[-1]
             values, vectors = np.linalg.eigh(H / np.outer(reach[:axes], reach[:axes]))
             inverse = (vectors / np.maximum(np.abs(values), 1.0)) @ vectors.T
             out[:axes, :axes] = inverse

@@ -140,24 +140,31 @@ class Curve(NamedTuple):
 def make_curve(first: float, interval: float, R: FloatArray, p: FloatArray) -> Curve:
     """The spline of control poses with rotations R (n, 3, 3) and positions p (n, 3)."""
     # Repeated products drift off SO(3), so take one Newton step to the nearest rotation.
-    R = 1.5 * R - 0.5 * R @ np.swapaxes(R, 1, 2) @ R
-    steps = so3.log(R[1:] @ np.swapaxes(R[:-1], 1, 2))
-    inverse_left = np.linalg.inv(so3.left_jacobian(steps))
-    contiguous = (np.ascontiguousarray(each, dtype=np.float64) for each in (R, p, steps, inverse_left))
-    return Curve(float(first), float(interval), *contiguous)
+    R = np.ascontiguousarray(1.5 * R - 0.5 * R @ np.swapaxes(R, 1, 2) @ R)
+    steps, inverse_left = np.zeros((len(R) - 1, 3)), np.zeros((len(R) - 1, 3, 3))
+    if not _fill_steps(R, steps, inverse_left):
+        steps = so3.log(R[1:] @ np.swapaxes(R[:-1], 1, 2))
+        inverse_left = np.linalg.inv(so3.left_jacobian(steps))
+    return Curve(float(first), float(interval), R, np.ascontiguousarray(p, dtype=np.float64), steps, inverse_left)
 
 
 def moved(curve: Curve, step: FloatArray) -> Curve:
     """The spline after a step (n, 6): control poses are rotated by exp of the first three values and shifted."""
     step = step.reshape(-1, 6)
-    return make_curve(curve.first, curve.interval, so3.exp(step[:, :3]) @ curve.R, curve.p + step[:, 3:])
+    R = _turned(curve.R, np.ascontiguousarray(step[:, :3]))
+    return make_curve(curve.first, curve.interval, R, curve.p + step[:, 3:])
 
 
 def from_pose_at(curve: Curve, tau: float) -> Curve:
     """The same trajectory relative to the body at time ``tau``."""
-    (R, t), _, _ = evaluate(curve, tau)
-    p = -R.T @ t
-    return make_curve(curve.first, curve.interval, curve.R @ R.T, (curve.p - p) @ R.T)
+    if curve.first <= tau <= curve.last:
+        views = blank_views(1)
+        fill_view(curve, tau, views, 0)
+        R, p = views.R[0], views.p[0]
+    else:
+        (R, t), _, _ = evaluate(curve, tau)
+        p = -R.T @ t
+    return curve._replace(R=curve.R @ R.T, p=(curve.p - p) @ R.T)  # the steps between control poses stay
 
 
 def part(curve: Curve, first: float, last: float, zero: float) -> Curve:
@@ -386,6 +393,49 @@ def _rotation(phi: Vector, identity: float, skew: float, outer: float) -> Matrix
     )
 
 
+_NEARLY_HALF_A_TURN = math.pi - 0.1
+
+
+@compiled(error_model="numpy")
+def _fill_steps(R: FloatArray, steps: FloatArray, inverse_left: FloatArray) -> bool:
+    """Fill the steps between rotations R (n, 3, 3), and their inverse left Jacobians; False: one is too large."""
+    for k in range(len(steps)):
+        M = _multiply(_matrix(R, k + 1), _transposed(_matrix(R, k)))
+        axis = (0.5 * (M[7] - M[5]), 0.5 * (M[2] - M[6]), 0.5 * (M[3] - M[1]))
+        sine = math.sqrt(dot(axis, axis))
+        angle = math.atan2(sine, 0.5 * (M[0] + M[4] + M[8] - 1.0))
+        if not angle < _NEARLY_HALF_A_TURN:
+            return False
+        phi = times(angle / sine if sine > 1e-8 else 1.0, axis)
+        s = dot(phi, phi)
+        if s < 1e-2:  # the closed form suffers from cancellation
+            outer = 1 / 12 + s / 720 * (1 + s / 42 * (1 + s / 40))
+        else:
+            one, half, _, _, _ = coefficients(s)
+            outer = (1.0 - 0.5 * one / half) / s
+        _set(steps, k, phi)
+        J = _rotation(phi, 1.0 - outer * s, -0.5, outer)
+        for m in range(3):
+            for n in range(3):
+                inverse_left[k, m, n] = J[3 * m + n]
+    return True
+
+
+@compiled(error_model="numpy")
+def _turned(R: FloatArray, w: FloatArray) -> FloatArray:
+    """exp(w) R for rotation vectors w (n, 3) and rotations R (n, 3, 3)."""
+    out = np.zeros_like(R)
+    for k in range(len(R)):
+        phi = _row(w, k)
+        s = dot(phi, phi)
+        one, half, _, _, _ = coefficients(s)
+        M = _multiply(_rotation(phi, 1.0 - half * s, one, half), _matrix(R, k))
+        for m in range(3):
+            for n in range(3):
+                out[k, m, n] = M[3 * m + n]
+    return out
+
+
 @compiled(error_model="numpy")
 def _multiply(a: Matrix, b: Matrix) -> Matrix:
     return (
@@ -514,18 +564,39 @@ def roughness(
         log_density += count * float(np.log(row[-1]))
         total += 3 * count
         weights = -np.diff(np.concatenate([[0.0], row, [0.0]]))
-        by = np.zeros((2, count, len(weights) + 1, 3, 3))
-        for j, c in enumerate(weights):
-            left = curve.inverse_left[j : j + count]
-            by[0, :, j + 1] += c * left
-            by[0, :, j] -= c * np.swapaxes(left, 1, 2)
-            by[1, :, j + 1] += c * np.eye(3)
-            by[1, :, j] -= c * np.eye(3)
-        for kind in range(2):
-            errors = np.asarray(sum(c * steps[kind][j : j + count] for j, c in enumerate(weights)))
-            add_blocks(gradients[kind], bands[kind], by[kind], errors, np.arange(count), 3 * kind)
-            squares[kind] += np.sum(errors**2)
+        _add_differences(weights, count, *steps, curve.inverse_left, squares, gradients, bands)
     return Roughness(squares, gradients, bands, total, log_density)
+
+
+@compiled
+def _add_differences(
+    weights: FloatArray,
+    count: int,
+    turns: FloatArray,
+    shifts: FloatArray,
+    inverse_left: FloatArray,
+    squares: FloatArray,
+    gradients: FloatArray,
+    bands: FloatArray,
+) -> None:
+    """Add ``count`` weighted sums of successive steps, (n, 3) ``turns`` and ``shifts``, to a ``Roughness``."""
+    by, errors = np.zeros((2, len(weights) + 1, 3, 3)), np.zeros((2, 3))
+    for k in range(count):
+        by[:], errors[:] = 0.0, 0.0
+        for j in range(len(weights)):
+            c = weights[j]
+            for a in range(3):
+                errors[0, a] += c * turns[k + j, a]
+                errors[1, a] += c * shifts[k + j, a]
+                by[1, j + 1, a, a] += c
+                by[1, j, a, a] -= c
+                for b in range(3):
+                    by[0, j + 1, a, b] += c * inverse_left[k + j, a, b]
+                    by[0, j, a, b] -= c * inverse_left[k + j, b, a]
+        for kind in range(2):
+            _add_block(gradients[kind], bands[kind], by[kind], errors[kind], k, 3 * kind)
+            for a in range(3):
+                squares[kind] += errors[kind, a] ** 2
 
 
 def log_prior(curve: Curve, prior: Prior, rough: Roughness) -> float:
@@ -553,17 +624,25 @@ def add_blocks(
 def _add_blocks(
     gradient: FloatArray, band: FloatArray, by: FloatArray, errors: FloatArray, first: NDArray[np.int64], part: int
 ) -> None:
-    count, controls, size, _ = by.shape
-    for k in range(count):
-        for a in range(3 * controls):
-            row, i = 6 * (first[k] + a // 3) + part + a % 3, a % 3
+    for k in range(len(by)):
+        _add_block(gradient, band, by[k], errors[k], first[k], part)
+
+
+@compiled
+def _add_block(
+    gradient: FloatArray, band: FloatArray, by: FloatArray, errors: FloatArray, first: int, part: int
+) -> None:
+    """``add_blocks`` for one error (m,) with derivatives (k, m, 3)."""
+    controls, size, _ = by.shape
+    for a in range(3 * controls):
+        row, i = 6 * (first + a // 3) + part + a % 3, a % 3
+        for m in range(size):
+            gradient[row] += by[a // 3, m, i] * errors[m]
+        for b in range(a + 1):
+            column, j, total = 6 * (first + b // 3) + part + b % 3, b % 3, 0.0
             for m in range(size):
-                gradient[row] += by[k, a // 3, m, i] * errors[k, m]
-            for b in range(a + 1):
-                column, j, total = 6 * (first[k] + b // 3) + part + b % 3, b % 3, 0.0
-                for m in range(size):
-                    total += by[k, a // 3, m, i] * by[k, b // 3, m, j]
-                band[column, row - column] += total
+                total += by[a // 3, m, i] * by[b // 3, m, j]
+            band[column, row - column] += total
 
 
 def anchors(curve: Curve, width: int, precision: float) -> FloatArray:

@@ -54,7 +54,7 @@ from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOpti
 _AT_ONCE = 2
 """Number of pairs that are processed in parallel; parts of a pair's work use two cores by themselves."""
 _MOTIONS_AHEAD = 10
-"""Number of pairs with a motion that wait to be drawn: a group, so that the next trajectory is fitted meanwhile."""
+"""Number of pairs with a motion that wait to be drawn: a group; the next trajectory is fitted meanwhile."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
