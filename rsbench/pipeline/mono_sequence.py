@@ -53,8 +53,9 @@ from rsbench.vision.mono_fusion import Beyond, Flows, MonoFusion, MonoFusionOpti
 
 _AT_ONCE = 2
 """Number of pairs that are processed in parallel; parts of a pair's work use two cores by themselves."""
-_MOTIONS_AHEAD = 10
-"""Number of pairs with a motion that wait to be drawn: a group; the next trajectory is fitted meanwhile."""
+_PIXELS_AHEAD, _PAIRS_AHEAD = 3_000_000, (2, 10)
+"""Pixels, and number of pairs, that wait to be drawn while the next trajectory is fitted, which takes as long for
+small frames as for large ones."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,14 +124,15 @@ def correct_frames(
     turn = turned(camera, shutter)
     pending: CorrectedMoment | None = None
     each: _Frame | None = None
-    for each in _with_neighbours(_pairs(frames, turn, options, done, gyro, starts)):
+    every = _with_neighbours(_pairs(frames, turn, options, done, gyro, starts))
+    for each, moment in map_ahead(lambda one: (one, _corrected(one, turn, options)), every, 1, 1):
         if each.number < done:
             continue
         if each.number == 1 and each.after is None and each.before and not each.before.fusion:
             raise RsbenchError(f"frames: {each.before.reason}")
         if pending is not None:
             yield pending
-        pending = _corrected(each, turn, options)
+        pending = moment
         if each.number > 0:  # the first frame waits until it is known whether a third one follows
             yield pending
             pending = None
@@ -203,7 +205,8 @@ def _pairs(
     seen = kept(map_ahead(look, pairs, _AT_ONCE, _AT_ONCE))
     rig = StereoRig.of_one(turn.camera)
     paths = (None for _ in seen) if gyro is not None else shared_trajectory(seen, rig, turn.shutter, begin, first)
-    for each, pair in map_ahead(ready, ahead(in_order(paths), _MOTIONS_AHEAD), _AT_ONCE, _AT_ONCE):
+    most = int(np.clip(_PIXELS_AHEAD // (turn.camera.width * turn.camera.height), *_PAIRS_AHEAD))
+    for each, pair in map_ahead(ready, ahead(in_order(paths), most), _AT_ONCE, _AT_ONCE):
         yield each.number + 1, *each.images, pair
 
 
@@ -327,6 +330,8 @@ frame has up to 1.2 and 1.7 although its corrected frames have a third of the er
 _CONSISTENT_PX, _CLIPPED_PX, _SMOOTHED_PX = 0.5, 4.0, 1.5
 """Largest forward-backward error of usable flow; displacement beyond which errors do not grow, since the pixel
 shows something else; blur of the image by whose gradients displacements become grey levels; all in px."""
+_SOME = np.s_[::2, ::2]
+"""The pixels whose errors are averaged."""
 UNTRUSTED = "its correction is not expected to be better than the frame as read, which is kept"
 
 
@@ -349,23 +354,24 @@ def expected_errors(
     height, width = flows.shape
     grey = cv2.resize(grey_u8(image), (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
     grey = cv2.GaussianBlur(grey, (0, 0), _SMOOTHED_PX)
+    slopes = [cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, scale=0.125)[_SOME] for dx in (1, 0)]
     columns, rows = (
-        ((np.arange(n) + 0.5) * s).astype(np.intp) for n, s in zip((width, height), flows.scale, strict=True)
+        ((np.arange(n) + 0.5) * s).astype(np.intp)[_SOME[0]]
+        for n, s in zip((width, height), flows.scale, strict=True)
     )
     away = (drawn[np.ix_(rows, columns)][..., :2] - np.stack(np.meshgrid(columns, rows), axis=-1)) / flows.scale
-    later, good = ((line - rows) / lines)[:, None], np.ones(grey.shape, dtype=np.bool_)
+    later, good = ((line - rows) / lines)[:, None], np.ones(slopes[0].shape, dtype=np.bool_)
     ends = list[tuple[Any, Any]]()
     for fusion, place in seen:  # times in readouts, which pairs of different lengths share
-        flow, period = fusion.flows.flow[place], (1.0 - 2.0 * place) / fusion.own.shutter.readout_ratio
-        ends.append((period + flow[..., 1] / height, flow))
-        good &= fusion.flows.returns[place] < _CONSISTENT_PX
+        flow = fusion.flows.flow[place][_SOME]
+        ends.append(((1.0 - 2.0 * place) / fusion.own.shutter.readout_ratio + flow[..., 1] / height, flow))
+        good &= fusion.flows.returns[place][_SOME] < _CONSISTENT_PX
     (a, to_first), (b, to_last) = ends[0], ends[-1]
     if len(ends) == 1:
         moved = (later / a)[..., None] * to_first
     else:
         moved = (later * (later - b) / (a * (a - b)))[..., None] * to_first
         moved = moved + (later * (later - a) / (b * (b - a)))[..., None] * to_last
-    slopes = [cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, scale=0.125) for dx in (1, 0)]
     errors = []
     for off in (away - moved, moved):
         length = np.linalg.norm(off, axis=-1)

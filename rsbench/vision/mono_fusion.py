@@ -332,7 +332,7 @@ class MonoFusion:
             poses = row_poses(own.rig, own.shutter, own.motion, own.side, frame)
             maps = line_maps(own.rig.sensor(own.side), poses, target)
         given = flow, layer.rho, layer.flow_share, maps, target_tau - here, float(1 - 2 * frame), rate
-        places = np.full((height, width, 3), np.nan)
+        places = np.full((height, width, 3), np.nan, dtype=np.float32)
         drawn = np.ones((height, width), np.bool_) if wanted is None else layer.measured
         if wanted is not None and maps is not None:
             near = _blocks_near(wanted)
