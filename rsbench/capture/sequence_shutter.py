@@ -76,7 +76,9 @@ from rsbench.core.so3 import FloatArray
 from rsbench.core.uncertainty import shared_error_factor, spread_about, tempered, tiles, variance_factor
 from rsbench.solvers.engine.levenberg_marquardt import descend
 
-_Start, _Item, _Result = TypeVar("_Start"), TypeVar("_Item"), TypeVar("_Result")
+_Start = TypeVar("_Start")
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 LONGEST = 12
 """Most successive windows that are used; further ones would hardly reduce the error."""
 SUCCESSIVE = 6

@@ -143,8 +143,8 @@ def make_curve(first: float, interval: float, R: FloatArray, p: FloatArray) -> C
     R = np.ascontiguousarray(1.5 * R - 0.5 * R @ np.swapaxes(R, 1, 2) @ R)
     steps, inverse_left = np.zeros((len(R) - 1, 3)), np.zeros((len(R) - 1, 3, 3))
     if not _fill_steps(R, steps, inverse_left):
-        steps = so3.log(R[1:] @ np.swapaxes(R[:-1], 1, 2))
-        inverse_left = np.linalg.inv(so3.left_jacobian(steps))
+        steps[:] = so3.log(R[1:] @ np.swapaxes(R[:-1], 1, 2))
+        inverse_left[:] = np.linalg.inv(so3.left_jacobian(steps))
     return Curve(float(first), float(interval), R, np.ascontiguousarray(p, dtype=np.float64), steps, inverse_left)
 
 

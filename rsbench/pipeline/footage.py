@@ -616,17 +616,18 @@ class Forecast:
     """Seconds per frame and million pixels."""
     frame_s: float
     """Seconds per frame of any size."""
-    bytes: float
-    """Bytes of memory per pixel."""
     start_s: float
-    start_bytes: float
+    memory: tuple[tuple[float, ...], tuple[float, ...]]
+    """Million pixels of a frame, and GB for such frames, of which larger ones are shrunk for their flow."""
 
     def words(self, frames: int, pixels: int) -> str:
         """Text with the time and memory for a number of frames with a number of pixels each."""
         seconds = self.start_s + frames * (self.frame_s + self.seconds * pixels / 1e6)
-        gigabytes = (self.start_bytes + self.bytes * pixels) / 1e9
+        gigabytes = float(np.interp(pixels / 1e6, *self.memory))
         time = f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} min"
         return f"about {time} on two cores, {gigabytes:.1f} GB of memory"
 
 
-FORECAST = Forecast(seconds=0.5, frame_s=0.25, bytes=730.0, start_s=16.0, start_bytes=4.8e8)
+FORECAST = Forecast(
+    seconds=0.5, frame_s=0.25, start_s=16.0, memory=((0.0, 0.23, 2.07, 8.29), (0.5, 0.65, 1.95, 3.1))
+)
