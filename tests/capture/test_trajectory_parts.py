@@ -21,6 +21,7 @@ from rsbench.capture.trajectory_spline import (
     blank_views,
     evaluate,
     fill_views,
+    from_pose_at,
     make_curve,
     moved,
     roughness,
@@ -35,6 +36,7 @@ from rsbench.capture.trajectory_tracks import (
     pack_windows,
 )
 from rsbench.components.motion_models import LinearMotion, motion_record, read_motion
+from rsbench.core import so3
 from rsbench.core.correspondences import Correspondences
 from rsbench.core.rig import StereoRig
 from rsbench.core.so3 import FloatArray
@@ -52,6 +54,46 @@ def differences(of: Callable[[Curve], FloatArray], curve: Curve, step: float) ->
     for unit in np.eye(6 * len(curve.p)):
         out.append((of(moved(curve, step * unit)) - of(moved(curve, -step * unit))) / (2.0 * step))
     return np.stack(out, axis=-1)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-7, 0.05, 0.11, 1.0, 3.0, np.pi - 1e-3])
+def test_steps_between_control_poses_are_those_of_scipy(size: float) -> None:
+    axes = np.random.default_rng(3).normal(size=(8, 3))
+    steps = size * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    R = np.eye(3)[None]
+    for step in steps:
+        R = np.concatenate([R, (Rotation.from_rotvec(step).as_matrix() @ R[-1])[None]])
+    curve = make_curve(0.0, 0.5, R, np.zeros((9, 3)))
+    # Near half a turn the angle is determined by the root of the rounding errors.
+    np.testing.assert_allclose(curve.steps, steps, atol=1e-12 if size < 3.1 else 1e-8)
+    inverses = np.linalg.inv(so3.left_jacobian(steps))
+    np.testing.assert_allclose(curve.inverse_left, inverses, atol=1e-11 if size < 3.1 else 1e-7)
+    turns = np.random.default_rng(4).normal(size=(9, 6))
+    np.testing.assert_allclose(
+        moved(curve, turns).R, Rotation.from_rotvec(turns[:, :3]).as_matrix() @ R, atol=1e-13
+    )
+
+
+@pytest.mark.parametrize("tau", [-0.4, 0.0, 1.3, -2.0, 9.0])
+def test_the_same_trajectory_relative_to_the_body_at_a_time(tau: float) -> None:
+    curve, taus = wild(np.random.default_rng(2)), np.linspace(-0.4, 3.1, 9)
+    there, before, here = (evaluate(from_pose_at(curve, tau), taus), evaluate(curve, taus), evaluate(curve, tau))
+    R = before[0].R @ here[0].R.T
+    np.testing.assert_allclose(there[0].R, R, atol=1e-13)
+    np.testing.assert_allclose(there[0].t, before[0].t - R @ here[0].t, atol=1e-12)
+    np.testing.assert_allclose(there[1], before[1], atol=1e-12)
+
+
+def test_some_tracks_alone_are_all_with_no_weight_for_the_others() -> None:
+    rng = np.random.default_rng(5)
+    windows, _ = matches(sines(rng, 1.0, 0.5, 2.0), 4, rng)
+    tracks, curve = pack_windows(windows, RIG, SHUTTER), wild(np.random.default_rng(5))
+    chosen = np.arange(len(tracks)) % 3 == 0
+    rest = Tails(5.0, 0.3), Prior(0.2, 1, 1.0, 1.0)
+    alone = normal_equations(curve, tracks.only(chosen), *rest, np.ones(np.count_nonzero(chosen)))
+    every = normal_equations(curve, tracks, *rest, chosen.astype(np.float64))
+    np.testing.assert_allclose(alone.cost, every.cost, rtol=1e-12)
+    np.testing.assert_allclose(alone.gradient, every.gradient, atol=1e-9 * np.max(np.abs(every.gradient)))
 
 
 def test_poses_and_their_derivatives_by_the_control_poses() -> None:
