@@ -35,6 +35,7 @@ from rsbench.solvers.engine.base import Solver, entry_of
 from rsbench.vision.corrector import demand_corrected, load_corrector
 from rsbench.vision.feature_matcher import load_features
 from rsbench.vision.fusion import Fused, finished
+from rsbench.vision.images import single_opencv
 from rsbench.vision.stereo_matcher import load_matcher
 
 
@@ -109,8 +110,9 @@ def of_one_camera(
     samples = gyro_samples(gyro)
     log = None if samples is None else Gyroscope(samples=samples, clock_error=gyro_clock_error)
     options, sources = options_of_camera(inpaint, seed, target_row), [ImageSource(images)]
-    found = know_capture(sources, OneCameraCard.of(camera, readout_ratio), options, log)
-    frames = [moment.shown["left"] for moment in correct_sequence(sources, found, options)]
+    with single_opencv():
+        found = know_capture(sources, OneCameraCard.of(camera, readout_ratio), options, log)
+        frames = [moment.shown["left"] for moment in correct_sequence(sources, found, options)]
     return [finished(fused) for fused in frames] if inpaint is None else frames
 
 
