@@ -319,10 +319,10 @@ def correct_known_rows(
     return [{view: inpainted(fused, options) for view, fused in corrected.items()} for corrected in found]
 
 
-_CREDIBLE = 0.9
+_CREDIBLE = 0.93
 """Least share of the flow beside moving objects that the motion of a rig must explain. It is at least 0.96 on
-rendered frames, with objects in a quarter of the image that move as fast as the rig; 0.93 to 0.99 on real frames
-of slow traffic; and 0.53 to 0.95 on others, of which motion or convergence are wrong."""
+rendered frames, also of posts and trees where flow errs, and 0.98 on real frames whose calibration is right; 0.76
+to 0.93 on others, of which motion or convergence are wrong; below 0.3 if a motion is clearly wrong."""
 
 
 def _credible(

@@ -198,7 +198,9 @@ def _explained(
     """Share of the consistent flow of textured pixels that ends on the curves on which static points move, there
     or beside, since flow extends over edges; without the ``evidence`` (H, W) of objects that move.
 
-    ``back`` is called only if flow off the curves may be inconsistent.
+    Flow off the curves counts only where the other frame looks clearly more similar at its end than on the curve:
+    among posts that look alike, flow is consistent and wrong. ``back`` is called only if flow off the curves may
+    be inconsistent.
     """
     nearest = still.nearest(flow)
     on = (np.linalg.norm(flow - nearest, axis=-1) <= least).astype(np.uint8)  # 0 for NaN
@@ -209,7 +211,11 @@ def _explained(
     if np.count_nonzero(on & used) >= _MOST * np.count_nonzero(used):
         return 1.0
     used &= returns_px(flow, back()) < 0.5 * RETURNS_PX
-    return float(np.mean(on[used])) if np.count_nonzero(used) > _FEW * used.size else 1.0
+    off, behind = used & ~on, ~still.unknown & np.isnan(nearest[..., 0])
+    off &= _clearly_better(greys, flow, nearest, off, behind | leaves(nearest))
+    agreeing, contradicting = np.count_nonzero(used & on), np.count_nonzero(off)
+    judged = agreeing + contradicting
+    return agreeing / judged if judged > _FEW * used.size else 1.0
 
 
 def _regions(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

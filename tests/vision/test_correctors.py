@@ -19,6 +19,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.projection import back_project, rs_project_near
 from rsbench.core.rig import VIEWS, StereoRig, View
 from rsbench.core.shutter import RollingShutter
+from rsbench.vision import correctors
 from rsbench.vision.corrector import (
     CORRECTORS,
     CorrectionProblem,
@@ -267,6 +268,22 @@ def test_a_ball_goes_its_own_flow_and_the_wall_is_seen_beside_it(worlds: tuple[A
     assert _rms(found[True].image, 255.0 * true, rim) < 0.7 * _rms(found[False].image, 255.0 * true, rim)
     assert np.mean(found[True].origin[inner] == Origin.HERE) > 0.98
     np.testing.assert_array_equal(found[True].image[~rim], found[False].image[~rim])
+
+
+@pytest.mark.parametrize("period", [24, None])
+def test_flow_counts_against_a_motion_only_where_the_images_agree_with_it(period: int | None) -> None:
+    """Posts every 24 px that move by 9 px also look as if they moved by -15 px; other texture does not."""
+    height, width, right, wrong = 96, 576, 9, -15
+    texture = np.random.default_rng(0).integers(0, 255, (height, period or width + 64), dtype=np.uint8)
+    wide = np.tile(texture, (1, 30))[:, : width + 64]
+    moves = right if period else wrong  # posts move as the motion says, other texture as the flow says
+    greys = [wide[:, 32 : 32 + width], wide[:, 32 - moves : 32 - moves + width]]
+    flow, place = (np.full((height, width, 2), [each, 0.0], dtype=np.float32) for each in (wrong, right))
+    flow[: height // 2, :, 0] = right if period else wrong
+    nowhere = np.zeros((height, width), dtype=np.bool_)
+    still = correctors._Still(far=place, near=place, hidden=nowhere, unknown=nowhere)
+    found = correctors._explained(greys, flow, lambda: -flow, still, 1.0, None)
+    assert found > 0.93 if period else found < 0.02
 
 
 def test_the_explained_share_of_the_flow_shows_a_wrong_motion(worlds: tuple[Any, Any], u8: Any) -> None:
