@@ -27,9 +27,10 @@ from rsbench.core.camera import PinholeCamera
 from rsbench.core.pose_errors import rotation_error, translation_error
 from rsbench.core.rig import StereoRig
 from rsbench.core.shutter import RollingShutter
-from rsbench.core.version import RELEASE
+from rsbench.core.version import RELEASE, __version__
 from rsbench.dataset.card import load_dataset_card
 from rsbench.solvers.engine.base import list_solvers, load_solver_entry
+from rsbench.storage.untrusted_files import read_json
 
 DOCS = ROOT / "docs"
 SOURCES = sorted((ROOT / "rsbench").rglob("*.py"))
@@ -330,6 +331,21 @@ def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
     assert "scipy" in {entry.name for entry in metadata.entry_points(group="rsbench.solvers")}
     assert "scipy" in list_solvers()
     assert load_solver_entry("scipy").name == "scipy"
+
+
+OLDER = {
+    *("claims", "correction", "fig3", "footage", "gyro", "handheld", "held-out", "images", "leaderboard", "r6p"),
+    *("readings", "real", "recorded", "rectify", "solvers", "speed", "sweeps", "trajectory", "tuning"),
+}
+"""Folders of results with files that code before 1.1 made; empty when 1.1 is released."""
+
+
+def test_results_are_made_by_this_minor_version_or_listed_as_older() -> None:
+    own, older = __version__.rpartition(".")[0], set[str]()
+    for path in sorted(ROOT.glob("results/*/*provenance.json")):
+        if read_json(path)["rsbench"].rpartition(".")[0] != own:
+            older.add(path.parent.name)
+    assert older == OLDER
 
 
 # Packaging
