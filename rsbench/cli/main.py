@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import errno
-import gc
 import os
 import sys
 import warnings
@@ -121,7 +120,6 @@ _NAMELESS = {
 
 def run() -> None:
     """Entry point: every error becomes one line on stderr; exit code 2 for bad input, 70 for unexpected errors."""
-    gc.set_threshold(10_000)  # the default collects 260 times while the modules of a command are loaded
     try:
         with exits.stoppable():
             code = _with_one_command(app, sys.argv[1:])(prog_name="rsbench", standalone_mode=False)
@@ -137,8 +135,6 @@ def run() -> None:
         if isinstance(error, OSError) and (place := error.filename or _NAMELESS.get(error.errno or 0)):
             _fail(f"{place}: {error.strerror or error}")
         _fail(exits.describe(error), exits.EXIT_CODE)
-    finally:
-        gc.freeze()  # or the interpreter's last collections visit all that is loaded, for 0.2 to 0.4 s
 
 
 def _with_one_command(whole: Callable[..., Any], words: Sequence[str]) -> Callable[..., Any]:
