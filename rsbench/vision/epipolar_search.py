@@ -55,8 +55,8 @@ _BAND = 32
 """Number of rows for which the costs of all depths are stored at a time."""
 _ALIKE = 14.0
 """Largest mean cost, in the window, of an accepted depth; at wrong places it is about 20."""
-_CHORD = 16
-"""Number of steps along the curve between exactly computed places. Between them it is straight to 0.1 px."""
+_CHORD = 8
+"""Number of steps along the curve between exactly computed places. Between them it is straight to 0.03 px."""
 _BETTER = 6.0
 """Least difference of mean costs at which a found depth replaces a known one."""
 _WORSE = 0.5
