@@ -381,6 +381,7 @@ def _likeliest(step: Callable[[_Start], _Found], starts: Iterable[_Start], count
 
 
 def _in_threads(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
+    """The results of ``work``, in order, which all cores compute: most of it is compiled code."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(work, items))
 

@@ -374,10 +374,7 @@ def _fill_turn(curve: Curve, i: int, b: Vector, rates: Vector, views: Views, k: 
         later = _scaled(-b[j], _multiply(jacobian, _transposed(inverse)))
         before = _multiply(before, _rotation(phi, 1.0 - half * square, one, half))
     _set_matrix(views.turn, k, 0, later, 1.0, before)
-    R = _multiply(before, _matrix(curve.R, i))
-    for m in range(3):
-        for n in range(3):
-            views.R[k, m, n] = R[3 * m + n]
+    _fill_matrix(views.R, k, _multiply(before, _matrix(curve.R, i)))
     _set(views.spin, k, spin)
 
 
@@ -394,6 +391,7 @@ def _rotation(phi: Vector, identity: float, skew: float, outer: float) -> Matrix
 
 
 _NEARLY_HALF_A_TURN = math.pi - 0.1
+"""Angle, radians, from which the axis is no longer well determined by R - R^T."""
 
 
 @compiled(error_model="numpy")
@@ -414,10 +412,7 @@ def _fill_steps(R: FloatArray, steps: FloatArray, inverse_left: FloatArray) -> b
             one, half, _, _, _ = coefficients(s)
             outer = (1.0 - 0.5 * one / half) / s
         _set(steps, k, phi)
-        J = _rotation(phi, 1.0 - outer * s, -0.5, outer)
-        for m in range(3):
-            for n in range(3):
-                inverse_left[k, m, n] = J[3 * m + n]
+        _fill_matrix(inverse_left, k, _rotation(phi, 1.0 - outer * s, -0.5, outer))
     return True
 
 
@@ -429,10 +424,7 @@ def _turned(R: FloatArray, w: FloatArray) -> FloatArray:
         phi = _row(w, k)
         s = dot(phi, phi)
         one, half, _, _, _ = coefficients(s)
-        M = _multiply(_rotation(phi, 1.0 - half * s, one, half), _matrix(R, k))
-        for m in range(3):
-            for n in range(3):
-                out[k, m, n] = M[3 * m + n]
+        _fill_matrix(out, k, _multiply(_rotation(phi, 1.0 - half * s, one, half), _matrix(R, k)))
     return out
 
 
@@ -473,6 +465,14 @@ def _matrix(matrices: FloatArray, i: int) -> Matrix:
         *(matrices[i, 1, 0], matrices[i, 1, 1], matrices[i, 1, 2]),
         *(matrices[i, 2, 0], matrices[i, 2, 1], matrices[i, 2, 2]),
     )
+
+
+@compiled(error_model="numpy")
+def _fill_matrix(out: FloatArray, k: int, a: Matrix) -> None:
+    """Fill number ``k`` of matrices (n, 3, 3)."""
+    for m in range(3):
+        for n in range(3):
+            out[k, m, n] = a[3 * m + n]
 
 
 @compiled(error_model="numpy")
