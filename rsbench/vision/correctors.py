@@ -211,11 +211,12 @@ def _explained(
     if np.count_nonzero(on & used) >= _MOST * np.count_nonzero(used):
         return 1.0
     used &= returns_px(flow, back()) < 0.5 * RETURNS_PX
+    if np.count_nonzero(used) <= _FEW * used.size:
+        return 1.0
     off, behind = used & ~on, ~still.unknown & np.isnan(nearest[..., 0])
     off &= _clearly_better(greys, flow, nearest, off, behind | leaves(nearest))
     agreeing, contradicting = np.count_nonzero(used & on), np.count_nonzero(off)
-    judged = agreeing + contradicting
-    return agreeing / judged if judged > _FEW * used.size else 1.0
+    return agreeing / (agreeing + contradicting) if agreeing or contradicting else 1.0
 
 
 def _regions(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
