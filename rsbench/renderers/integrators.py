@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from rsbench.renderers.mitsuba_modules import dr, mi
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.sensor import level
+from rsbench.renderers.sensor import LineRays, level
 
 
 class Hits(NamedTuple):
@@ -134,10 +134,10 @@ class Placed:
         return [R[k] * v.x + R[3 + k] * v.y + R[6 + k] * v.z for k in range(3)]
 
 
-def placed(scene: MitsubaScene, sensor: Any, pose: Any, active: Any = True) -> list[Placed]:
-    """Return the moving objects of a scene at the times of the sensor's poses; ``pose`` is an index per lane."""
+def placed(scene: MitsubaScene, rays: LineRays, pose: Any, active: Any = True) -> list[Placed]:
+    """Return the moving objects of a scene at the times of the rays' poses; ``pose`` is an index per lane."""
     return [
-        Placed(each, ball, sensor.object_pose(number, pose, active))
+        Placed(each, ball, rays.object_pose(number, pose, active))
         for number, (each, ball) in enumerate(zip(scene.objects, scene.balls, strict=True))
     ]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,7 +29,7 @@ from rsbench.renderers.mitsuba_modules import dr, mi
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.pixel_samples import instant_count, instant_times
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.sensor import make_sensor, object_tables, pose_table
+from rsbench.renderers.sensor import LineRays, object_tables, pose_table
 
 Float32Array = NDArray[np.float32]
 OnGlobalFrame = Callable[[int, Float32Array], None]
@@ -131,9 +131,9 @@ def _single_pass(
 ) -> Frame:
     """Render by ``single-pass``; ``poses`` are those of the image and those of the depth."""
     tracer = _tracer()
-    image_sensor, row_sensor = (_sensor(camera, each) for each in poses)
-    image = tracer.radiance_rows(scene, image_sensor, camera, rows, options)
-    return Frame(image=image, **tracer.depth_rows(scene, row_sensor, camera, rows)._asdict())
+    image_rays, row_rays = (_rays(camera, each) for each in poses)
+    image = tracer.radiance_rows(scene, image_rays, camera, rows, options)
+    return Frame(image=image, **tracer.depth_rows(scene, row_rays, camera, rows)._asdict())
 
 
 def _stitched(
@@ -150,7 +150,7 @@ def _stitched(
     numbers and rounding: they have the bits of the whole image. For columns, all rows are traced.
     """
     tracer, columns = _tracer(), poses[0].columns
-    sensors = [_sensor(camera, each) for each in poses]
+    rays = [_rays(camera, each) for each in poses]
     tables = [
         [pose_table(camera, each.R, each.t, columns), *object_tables(camera, each.objects, columns)]
         for each in poses
@@ -158,13 +158,13 @@ def _stitched(
     image = np.zeros((len(rows), camera.width, 3), dtype=np.float32)
     hits = Hits.none(len(rows), camera.width)
     for place, line in enumerate(range(camera.width) if columns else rows):
-        for sensor, own in zip(sensors, tables, strict=True):
-            one, *others = (np.repeat(each[..., line : line + 1, :], each.shape[-2], axis=-2) for each in own)
-            sensor.set_poses(one, columns)
-            sensor.set_objects(others)
+        for each, own in zip(rays, tables, strict=True):
+            one, *others = (np.repeat(t[..., line : line + 1, :], t.shape[-2], axis=-2) for t in own)
+            each.set_poses(one)
+            each.set_objects(others)
         traced = rows if columns else range(camera.height) if options.full_frames else [line]
-        gs_image = tracer.radiance_rows(scene, sensors[0], camera, traced, options)
-        gs_hits = tracer.depth_rows(scene, sensors[1], camera, traced)
+        gs_image = tracer.radiance_rows(scene, rays[0], camera, traced, options)
+        gs_hits = tracer.depth_rows(scene, rays[1], camera, traced)
         kept = line if options.full_frames else 0
         to, of = (np.s_[:, line], np.s_[:, line]) if columns else (np.s_[place], np.s_[kept])
         for result, whole in zip((image, *hits), (gs_image, *gs_hits), strict=True):
@@ -174,8 +174,8 @@ def _stitched(
     return Frame(image=image, **hits._asdict())
 
 
-def _sensor(camera: PinholeCamera, poses: LinePoses) -> Any:
-    return make_sensor(camera, poses.R, poses.t, poses.objects, columns=poses.columns)
+def _rays(camera: PinholeCamera, poses: LinePoses) -> LineRays:
+    return LineRays.of(camera, poses.R, poses.t, poses.objects, columns=poses.columns)
 
 
 def _check_objects(scene: MitsubaScene, objects: Pose | None, options: RendererOptions) -> None:

@@ -25,19 +25,20 @@ from rsbench.renderers.mitsuba_modules import dr, mi
 from rsbench.renderers.options import RendererOptions
 from rsbench.renderers.pixel_samples import facet_points, instant_of, sky_points, subpixel_grid
 from rsbench.renderers.scene import MitsubaScene
+from rsbench.renderers.sensor import LineRays
 
 Float32Array = NDArray[np.float32]
 
 
-def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int]) -> Hits:
+def depth_rows(scene: MitsubaScene, rays: LineRays, camera: PinholeCamera, rows: Sequence[int]) -> Hits:
     """Return the first hits of the rays through the pixel centres."""
     depth, labels, gloss = result = Hits.none(len(rows), camera.width)
     for place, row in enumerate(rows):
         for column in range(camera.width):
-            pose = column if sensor.columns else row
-            ray = mi.Ray3f(*sensor.row_ray(float(column), float(row), pose))
+            pose = column if rays.columns else row
+            ray = mi.Ray3f(*rays.row_ray(float(column), float(row), pose))
             if scene.objects:
-                found = depth_and_label(scene, ray, True, placed(scene, sensor, pose))
+                found = depth_and_label(scene, ray, True, placed(scene, rays, pose))
                 depth[place, column], labels[place, column], bsdf = found
             else:
                 hit = scene.scene.ray_intersect_preliminary(ray)
@@ -48,7 +49,7 @@ def depth_rows(scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Se
 
 
 def radiance_rows(
-    scene: MitsubaScene, sensor: Any, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
+    scene: MitsubaScene, rays: LineRays, camera: PinholeCamera, rows: Sequence[int], options: RendererOptions
 ) -> Float32Array:
     """Return linear RGB (rows, width, 3): the mean over the sub-pixel grid (a box filter)."""
     grid = subpixel_grid(options.samples).tolist()
@@ -59,7 +60,7 @@ def radiance_rows(
         above = [mi.Vector3f(*point) for point in sky[sample]]
         facet = mi.Point2f(facets[sample]) if scene.glossy else None
         ray = mi.Ray3f(origin, dr.normalize(direction))
-        return sunsky_radiance(scene, ray, True, above, placed(scene, sensor, pose), facet)
+        return sunsky_radiance(scene, ray, True, above, placed(scene, rays, pose), facet)
 
     def path(origin: Any, direction: Any, pixel: int, sample: int, pose: int) -> Any:
         sampler = lane_sampler()
@@ -74,11 +75,11 @@ def radiance_rows(
         for column in range(camera.width):
             total = np.zeros(3, dtype=np.float32)
             for number, (dx, dy) in enumerate(grid):
-                pixel, pose = row * camera.width + column, column if sensor.columns else row
-                if sensor.instants > 1:
-                    instant = instant_of(options.seed, pixel, number, options.samples, sensor.instants)
-                    pose += sensor.lines * int(instant)
-                origin, direction = sensor.row_ray(column + dx, row + dy, pose)
+                pixel, pose = row * camera.width + column, column if rays.columns else row
+                if rays.instants > 1:
+                    instant = instant_of(options.seed, pixel, number, options.samples, rays.instants)
+                    pose += int(rays.lines) * int(instant)
+                origin, direction = rays.row_ray(column + dx, row + dy, pose)
                 total += np.asarray(trace(origin, direction, pixel, number, pose), dtype=np.float32)
             result[place, column] = total / np.float32(options.samples)
     return result

@@ -53,7 +53,11 @@ class Reflectances:
                 places[:, number] = begins[id(material)], width, height
         self._places, self._colours = [mi.UInt32(each) for each in places], [mi.Float(each) for each in colours]
         self._texels, self._codes = mi.UInt32(texels), mi.Float(linear_codes())
-        dr.eval(self._places, self._colours, self._texels, self._codes)
+        dr.eval(self.kernel_inputs())
+
+    def kernel_inputs(self) -> list[Any]:
+        """Return the arrays that ``at`` reads."""
+        return [self._places, self._colours, self._texels, self._codes]
 
     def texture(self, shape: Any) -> NDArray[np.uint8] | None:
         """Return the texture (h, w, 3) of a shape's material, or None."""
@@ -179,6 +183,11 @@ class MitsubaScene:
         self.sky = Sky(scene.light, self.scene.environment())
         gc.collect()  # `mi.traverse` leaves cyclic garbage that references its shape, and so the textures
 
+    def kernel_inputs(self) -> list[Any]:
+        """Return the Dr.Jit arrays, and the Mitsuba objects, that tracing rays in this scene reads."""
+        own = None if self._reflectances is None else self._reflectances.kernel_inputs()
+        return [self.scene, self.objects, self.balls, own, self.sky.kernel_inputs()]
+
     def reflectance(self, hit: Any, active: Any) -> Any:
         """Return the diffuse reflectance (RGB) at Mitsuba's interactions."""
         if self._reflectances is None:
@@ -229,6 +238,11 @@ class Sky:
         if light.environment is not None:
             open_ = irradiance_map(light.environment.radiance)
             self._around, self._open = emitter, mi.load_dict(_mapped(open_, light.environment))
+
+    def kernel_inputs(self) -> list[Any]:
+        """Return the arrays and emitters that the other methods read."""
+        colours = [self.sun_direction, self.up, self.sun_radiance, self.horizon, self.zenith, self.overhead]
+        return [*colours, self._around, self._open] if self.mapped else colours
 
     def seen_along(self, direction: Any) -> Any:
         """Return the sky's radiance along unit directions: the horizon's colour below, blended to the zenith's."""

@@ -1,7 +1,8 @@
 """The rolling-shutter camera: every ray starts from the camera pose of its image row, or column.
 
 ``rs_pinhole`` is an ordinary Mitsuba sensor, so any Mitsuba integrator can render through it; rsbench's own
-renderers call its ``row_ray`` directly. Poses and intrinsics are inputs of the compiled kernel, never constants.
+renderers take the rays from ``LineRays`` directly. Poses and intrinsics are inputs of the compiled kernel, never
+constants.
 
 The kernel undistorts every sample of a pixel separately, in double precision. The host undistorts the pixel
 centres and computes the inverse Jacobian there once. Starting from these, the chord method (Newton's with a
@@ -12,7 +13,7 @@ number of steps for the lens. The NumPy equivalent is ``rsbench.core.camera.Lens
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, field, fields
 from functools import cache, lru_cache
 from typing import Any
 
@@ -30,34 +31,57 @@ thousand times larger."""
 _MOST_STEPS = 12
 _TRIED = 65
 """Number of pixels along each side of the image that the host tests, including the outermost."""
+_ALIGNED = 64
+"""Bytes of a line of the processor's cache, and of its longest registers."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class LensRays:
     """Undistorts pixels of one camera in a kernel: parameters are its inputs, the lens model is compiled in."""
 
-    def __init__(self, camera: PinholeCamera, lens: Lens) -> None:
-        self.lens, self.width, self.steps = lens, dr.opaque(mi.UInt32, camera.width), chord_steps(camera, lens)
-        self._centre = [dr.opaque(mi.Float64, value) for value in (camera.cx, camera.cy)]
-        self._per_pixel = [dr.opaque(mi.Float64, 1.0 / value) for value in (camera.fx, camera.fy)]
-        self._k = {each.name: dr.opaque(mi.Float64, getattr(lens, each.name)) for each in fields(lens)[1:]}
-        self._most = dr.opaque(mi.Float, camera.width - 1.0), dr.opaque(mi.Float, camera.height - 1.0)
+    model: str
+    steps: int
+    """Number of steps of the chord method."""
+    width: Any
+    centre: list[Any]
+    per_pixel: list[Any]
+    """1 / fx and 1 / fy."""
+    k: dict[str, Any]
+    """Coefficients of the lens by their names."""
+    most: list[Any]
+    """Largest column and row."""
+    start: list[Any]
+    """What is known of the undistorted pixel centres, one value per pixel."""
+
+    @classmethod
+    def of(cls, camera: PinholeCamera, lens: Lens) -> LensRays:
+        """Undistort all pixel centres and determine the number of steps."""
         centres = camera.unproject(camera.pixel_grid())[..., :2].reshape(-1, 2)
         if lens.model == "kannala-brandt":
             # The tangent is stored too, because a GPU computes it in single precision only.
             tangent = np.hypot(centres[:, :1], centres[:, 1:])
             centres = np.concatenate([np.arctan(tangent), tangent], axis=1)
-        self._start = [mi.Float64(np.ascontiguousarray(column)) for column in centres.T]
+        return cls(
+            model=lens.model,
+            steps=chord_steps(camera, lens),
+            width=dr.opaque(mi.UInt32, camera.width),
+            centre=[dr.opaque(mi.Float64, value) for value in (camera.cx, camera.cy)],
+            per_pixel=[dr.opaque(mi.Float64, 1.0 / value) for value in (camera.fx, camera.fy)],
+            k={each.name: dr.opaque(mi.Float64, getattr(lens, each.name)) for each in fields(lens)[1:]},
+            most=[dr.opaque(mi.Float, size - 1.0) for size in (camera.width, camera.height)],
+            start=[mi.Float64(np.ascontiguousarray(column)) for column in centres.T],
+        )
 
     def pixel(self, x: Any, y: Any, active: Any) -> tuple[Any, ...]:
         """Return the values that ``coordinates`` needs for all samples of the pixel around (x, y)."""
-        if self.lens.model == "double-sphere":
+        if self.model == "double-sphere":
             return ()
         column, row = (
-            mi.UInt32(dr.clip(dr.floor(v + 0.5), 0.0, most)) for v, most in zip((x, y), self._most, strict=True)
+            mi.UInt32(dr.clip(dr.floor(v + 0.5), 0.0, most)) for v, most in zip((x, y), self.most, strict=True)
         )
-        start = [dr.gather(mi.Float64, table, row * self.width + column, active) for table in self._start]
+        start = [dr.gather(mi.Float64, table, row * self.width + column, active) for table in self.start]
         xd, yd = self._distorted(column, row)
-        if self.lens.model == "kannala-brandt":
+        if self.model == "kannala-brandt":
             return start[0], 1.0 / self._slope(start[0]), dr.sqrt(xd * xd + yd * yd), start[1]
         by_x, across, by_y = self._derivative(*start)
         determinant = by_x * by_y - across * across
@@ -65,21 +89,21 @@ class LensRays:
 
     def coordinates(self, x: Any, y: Any, pixel: tuple[Any, ...]) -> tuple[Any, Any]:
         """Return the undistorted coordinates x / z, y / z of pixel coordinates (x, y), in single precision."""
-        solve = {"kannala-brandt": self._kannala, "double-sphere": self._spheres}.get(self.lens.model, self._brown)
+        solve = {"kannala-brandt": self._kannala, "double-sphere": self._spheres}.get(self.model, self._brown)
         found = solve(*self._distorted(x, y), *pixel)
         return mi.Float(found[0]), mi.Float(found[1])
 
     def _distorted(self, x: Any, y: Any) -> list[Any]:
-        rates = zip((x, y), self._centre, self._per_pixel, strict=True)
+        rates = zip((x, y), self.centre, self.per_pixel, strict=True)
         return [(mi.Float64(value) - centre) * rate for value, centre, rate in rates]
 
     def _derivative(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
         """Return the Jacobian of the distortion, which is symmetric: its elements xx, xy and yy."""
-        k1, k2, p1, p2, k3, k4, k5, k6, _, _ = self._k.values()
+        k1, k2, p1, p2, k3, k4, k5, k6, _, _ = self.k.values()
         s = x * x + y * y
         gain = 1 + s * (k1 + s * (k2 + s * k3))
         bend = 2 * (k1 + s * (2 * k2 + s * 3 * k3))
-        if self.lens.model == "rational":
+        if self.model == "rational":
             below = 1 + s * (k4 + s * (k5 + s * k6))
             gain = gain / below
             bend = (bend - 2 * gain * (k4 + s * (2 * k5 + s * 3 * k6))) / below
@@ -89,14 +113,14 @@ class LensRays:
     def _brown(
         self, xd: Any, yd: Any, x0: Any, y0: Any, xd0: Any, yd0: Any, xx: Any, xy: Any, yy: Any
     ) -> tuple[Any, Any]:
-        k1, k2, p1, p2, k3, k4, k5, k6, _, _ = self._k.values()
+        k1, k2, p1, p2, k3, k4, k5, k6, _, _ = self.k.values()
         off_x, off_y = xd - xd0, yd - yd0
         x, y = x0 + xx * off_x + xy * off_y, y0 + xy * off_x + yy * off_y
         for _ in range(self.steps):
             square_x, square_y, twice = x * x, y * y, 2 * x * y
             s = square_x + square_y
             gain = 1 + s * (k1 + s * (k2 + s * k3))
-            if self.lens.model == "rational":
+            if self.model == "rational":
                 gain = gain / (1 + s * (k4 + s * (k5 + s * k6)))
             off_x = xd - (x * gain + p1 * twice + p2 * (s + 2 * square_x))
             off_y = yd - (y * gain + p1 * (s + 2 * square_y) + p2 * twice)
@@ -105,7 +129,7 @@ class LensRays:
 
     def _spheres(self, xd: Any, yd: Any) -> tuple[Any, Any]:
         """Undistort the double sphere model in closed form, as ``Lens.undistort`` does in NumPy."""
-        *_, xi, alpha = self._k.values()
+        *_, xi, alpha = self.k.values()
         s = xd * xd + yd * yd
         z = (1 - alpha * alpha * s) / (alpha * dr.sqrt(1 - (2 * alpha - 1) * s) + 1 - alpha)
         scale = (z * xi + dr.sqrt(z * z + (1 - xi * xi) * s)) / (z * z + s)
@@ -114,12 +138,12 @@ class LensRays:
 
     def _slope(self, angle: Any) -> Any:
         """Return the derivative of the distorted radius by the angle in the Kannala-Brandt model."""
-        k1, k2, _, _, k3, k4, *_ = self._k.values()
+        k1, k2, _, _, k3, k4, *_ = self.k.values()
         a = angle * angle
         return 1 + a * (3 * k1 + a * (5 * k2 + a * (7 * k3 + a * 9 * k4)))
 
     def _kannala(self, xd: Any, yd: Any, angle0: Any, rate: Any, radius0: Any, tangent0: Any) -> tuple[Any, Any]:
-        k1, k2, _, _, k3, k4, *_ = self._k.values()
+        k1, k2, _, _, k3, k4, *_ = self.k.values()
         radius = dr.sqrt(xd * xd + yd * yd)
         angle = angle0 + rate * (radius - radius0)
         for _ in range(self.steps):
@@ -138,7 +162,7 @@ class LensRays:
 @lru_cache(maxsize=2)
 def lens_rays(camera: PinholeCamera, lens: Lens) -> LensRays:
     """Return the rays of a camera; cached, because a million pixel centres take the host seconds."""
-    return LensRays(camera, lens)
+    return LensRays.of(camera, lens)
 
 
 def chord_steps(camera: PinholeCamera, lens: Lens) -> int:
@@ -200,33 +224,89 @@ def pose_table(
     return np.concatenate([axes.reshape(*t.shape[:-1], 9), centre], axis=-1).astype(np.float32)
 
 
-def make_sensor(
-    camera: PinholeCamera,
-    rotations: ArrayLike,
-    translations: ArrayLike,
-    objects: Pose | None = None,
-    *,
-    columns: bool = False,
-) -> Any:
-    """Make a Mitsuba sensor ``rs_pinhole`` of ``camera``'s size with these row poses and a box filter.
+@dataclass(kw_only=True)
+class LineRays:
+    """Rays of a camera that has a pose for each line: its arrays are inputs of the kernels that trace the rays.
 
-    Arguments and errors are as for ``pose_table``. Equal poses in all rows give a global shutter. ``objects`` are
-    the poses ``world_from_object`` of the moving objects, with an additional leading axis for the objects.
+    Lines are rows, or columns. With an exposure, each line has a pose at each of its instants.
     """
-    sensor_class()
-    film = {
-        "type": "hdrfilm",
-        "width": camera.width,
-        "height": camera.height,
-        "pixel_format": "rgb",
-        "component_format": "float32",
-        "rfilter": {"type": "box"},
-    }
-    sensor = mi.load_dict({"type": PLUGIN, "film": film, "sampler": {"type": "independent"}})
-    sensor.set_intrinsics(camera)
-    sensor.set_poses(pose_table(camera, rotations, translations, columns), columns)
-    sensor.set_objects(object_tables(camera, objects, columns))
-    return sensor
+
+    intrinsics: list[Any]
+    lens: LensRays | None
+    """Lens of a camera that has one, for arrays of rays."""
+    one_by_one: PinholeCamera | None
+    """The camera, for single rays of the scalar variant."""
+    columns: bool
+    """Whether there is one pose per column instead of per row."""
+    lines: Any = 0
+    """Number of poses per instant."""
+    instants: int = 1
+    """Number of instants of an exposure, and so of poses per line."""
+    poses: Any = None
+    objects: list[Any] = field(default_factory=list[Any])
+    """Poses of each moving object, at the same times as the poses of the camera."""
+
+    @classmethod
+    def of(
+        cls,
+        camera: PinholeCamera,
+        rotations: ArrayLike,
+        translations: ArrayLike,
+        objects: Pose | None = None,
+        *,
+        columns: bool = False,
+    ) -> LineRays:
+        """Return the rays of ``camera`` with these poses; arguments and errors are as for ``pose_table``.
+
+        Equal poses in all lines give a global shutter. ``objects`` are the poses ``world_from_object`` of the
+        moving objects, with an additional leading axis for the objects.
+        """
+        arrays = bool(dr.is_jit_v(mi.Float))
+        rays = cls(
+            intrinsics=[dr.opaque(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)],
+            lens=lens_rays(camera, camera.lens) if camera.lens is not None and arrays else None,
+            one_by_one=None if arrays else camera,
+            columns=columns,
+        )
+        rays.set_poses(pose_table(camera, rotations, translations, columns))
+        rays.set_objects(object_tables(camera, objects, columns))
+        return rays
+
+    def set_poses(self, table: NDArray[np.float32]) -> None:
+        """Set the poses from a table (lines, 12) or (instants, lines, 12) of ``pose_table``."""
+        self.lines = dr.opaque(mi.UInt32, table.shape[-2])
+        self.instants = table.shape[0] if table.ndim == 3 else 1
+        self.poses = kernel_input(table)
+
+    def set_objects(self, tables: Sequence[NDArray[np.float32]]) -> None:
+        """Set the poses of moving objects from ``object_tables``."""
+        self.objects = list(map(kernel_input, tables))
+
+    def row_ray(self, x: Any, y: Any, row: Any, active: Any = True, pixel: Any = None) -> tuple[Any, Any]:
+        """Return world origin and direction of the ray through pixel coordinates (x, y), at the pose ``row``.
+
+        With instants, ``row`` is ``row + lines * instant``; with columns, it counts columns. ``pixel`` is the
+        result of ``lens.pixel``, computed once for many samples. The direction has z = 1 in the camera frame, so
+        the ray parameter of a hit is its depth z.
+        """
+        u, v = self._coordinates(x, y, active, pixel)
+        p = entries(self.poses, row, active)
+        direction = [dr.fma(p[3 * i], u, dr.fma(p[3 * i + 1], v, p[3 * i + 2])) for i in range(3)]
+        return mi.Point3f(p[9], p[10], p[11]), mi.Vector3f(*level(direction))
+
+    def object_pose(self, number: int, row: Any, active: Any) -> list[Any]:
+        """Return the 12 values of the pose of an object; objects count from 0."""
+        return entries(self.objects[number], row, active)
+
+    def _coordinates(self, x: Any, y: Any, active: Any, pixel: Any) -> tuple[Any, Any]:
+        """Return the coordinates x / z, y / z of the ray through pixel coordinates (x, y)."""
+        if self.lens is not None:
+            return self.lens.coordinates(x, y, self.lens.pixel(x, y, active) if pixel is None else pixel)
+        if self.one_by_one is not None and self.one_by_one.lens is not None:
+            u, v, _ = self.one_by_one.unproject([float(x), float(y)]).tolist()
+            return u, v
+        fx, fy, cx, cy = self.intrinsics
+        return (x - cx) / fx, (y - cy) / fy
 
 
 def object_tables(camera: PinholeCamera, objects: Pose | None, columns: bool) -> list[NDArray[np.float32]]:
@@ -239,20 +319,18 @@ def object_tables(camera: PinholeCamera, objects: Pose | None, columns: bool) ->
     return list(tables)
 
 
-def _coordinates(sensor: Any, x: Any, y: Any, active: Any, pixel: Any) -> tuple[Any, Any]:
-    """Return the coordinates x / z, y / z of the ray through pixel coordinates (x, y)."""
-    if sensor.lens is not None:
-        return sensor.lens.coordinates(x, y, sensor.lens.pixel(x, y, active) if pixel is None else pixel)
-    if sensor.camera.lens is not None:  # one by one
-        u, v, _ = sensor.camera.unproject([float(x), float(y)]).tolist()
-        return u, v
-    fx, fy, cx, cy = sensor.intrinsics
-    return (x - cx) / fx, (y - cy) / fy
+def kernel_input(values: NDArray[Any]) -> Any:
+    """Return a flat Dr.Jit array of float32 or uint32 values; a list, for the scalar variant.
 
-
-def _held(table: NDArray[np.float32]) -> Any:
-    """Convert a table to the form that ``entries`` reads."""
-    return mi.Float(table.ravel()) if dr.is_jit_v(mi.Float) else table.ravel().tolist()
+    Dr.Jit uses NumPy's memory, and records a kernel again where its alignment differs; so it is aligned here.
+    """
+    if not dr.is_jit_v(mi.Float):
+        return values.ravel().tolist()
+    room = np.zeros(values.nbytes + _ALIGNED, np.uint8)
+    start = -room.ctypes.data % _ALIGNED
+    aligned = room[start : start + values.nbytes].view(values.dtype)
+    aligned[:] = values.ravel()
+    return (mi.UInt32 if values.dtype == np.uint32 else mi.Float)(aligned)
 
 
 def entries(poses: Any, row: Any, active: Any) -> list[Any]:
@@ -262,58 +340,30 @@ def entries(poses: Any, row: Any, active: Any) -> list[Any]:
     return [dr.gather(mi.Float, poses, row * 12 + k, active) for k in range(12)]
 
 
+def make_sensor(camera: PinholeCamera, rays: LineRays) -> Any:
+    """Make a Mitsuba sensor ``rs_pinhole`` of ``camera``'s size with these rays and a box filter."""
+    sensor_class()
+    film = {
+        "type": "hdrfilm",
+        "width": camera.width,
+        "height": camera.height,
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    sensor = mi.load_dict({"type": PLUGIN, "film": film, "sampler": {"type": "independent"}})
+    sensor.rays = rays
+    return sensor
+
+
 @cache
 def sensor_class() -> Any:
     """Return the class of the plugin ``rs_pinhole`` after registering it with the current Mitsuba variant."""
-    scalar = not dr.is_jit_v(mi.Float)
 
     class RSPinhole(mi.Sensor):
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
-            self.intrinsics = [mi.Float(1.0), mi.Float(1.0), mi.Float(0.0), mi.Float(0.0)]
-            self.lens: Any = None
-            self.poses: Any = None
-            self.objects: list[Any] = []
-            """Poses of each moving object, at the same times as the poses of the camera."""
-            self.columns = False
-            """Whether there is one pose per column instead of per row."""
-            self.lines = 0
-            """Number of poses per instant."""
-            self.instants = 1
-            """Number of instants of an exposure, and so of poses per row."""
-
-        def set_intrinsics(self, camera: PinholeCamera) -> None:
-            values = (camera.fx, camera.fy, camera.cx, camera.cy)
-            self.intrinsics = [dr.opaque(mi.Float, value) for value in values]
-            self.camera = camera
-            if camera.lens is not None and not scalar:
-                self.lens = lens_rays(camera, camera.lens)
-
-        def set_poses(self, table: NDArray[np.float32], columns: bool = False) -> None:
-            """Set the poses from a table (lines, 12) or (instants, lines, 12) of ``pose_table``."""
-            self.columns, self.lines = columns, table.shape[-2]
-            self.instants = table.shape[0] if table.ndim == 3 else 1
-            self.poses = _held(table)
-
-        def set_objects(self, tables: Sequence[NDArray[np.float32]]) -> None:
-            """Set the poses of moving objects from ``object_tables``."""
-            self.objects = list(map(_held, tables))
-
-        def row_ray(self, x: Any, y: Any, row: Any, active: Any = True, pixel: Any = None) -> tuple[Any, Any]:
-            """Return world origin and direction of the ray through pixel coordinates (x, y), at the pose ``row``.
-
-            With instants, ``row`` is ``row + lines * instant``; with columns, it counts columns. ``pixel`` is the
-            result of ``lens.pixel``, computed once for many samples. The direction has z = 1 in the camera frame,
-            so the ray parameter of a hit is its depth z.
-            """
-            u, v = _coordinates(self, x, y, active, pixel)
-            p = entries(self.poses, row, active)
-            direction = [dr.fma(p[3 * i], u, dr.fma(p[3 * i + 1], v, p[3 * i + 2])) for i in range(3)]
-            return mi.Point3f(p[9], p[10], p[11]), mi.Vector3f(*level(direction))
-
-        def object_pose(self, number: int, row: Any, active: Any) -> list[Any]:
-            """Return the 12 values of the pose of an object; objects count from 0."""
-            return entries(self.objects[number], row, active)
+            self.rays: LineRays
 
         def sample_ray(self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True) -> Any:
             """Implement Mitsuba's interface; ``position`` in [0, 1]^2 counts from the corner of the film."""
@@ -321,9 +371,9 @@ def sensor_class() -> Any:
             size, crop, offset = film.size(), film.crop_size(), film.crop_offset()
             x = position.x * crop[0] + offset[0]
             y = position.y * crop[1] + offset[1]
-            along, last = (x, size[0] - 1) if self.columns else (y, size[1] - 1)
+            along, last = (x, size[0] - 1) if self.rays.columns else (y, size[1] - 1)
             row = mi.UInt32(dr.clip(dr.floor(along), 0, last))
-            origin, direction = self.row_ray(x - 0.5, y - 0.5, row, active)
+            origin, direction = self.rays.row_ray(x - 0.5, y - 0.5, row, active)
             wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength, active)
             return mi.Ray3f(origin, dr.normalize(direction), time, wavelengths), weight
 

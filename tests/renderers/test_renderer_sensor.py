@@ -19,12 +19,13 @@ from rsbench.core.projection import row_poses as line_poses
 from rsbench.core.rig import StereoRig
 from rsbench.core.se3 import Pose
 from rsbench.core.shutter import RollingShutter, Scan
+from rsbench.renderers import wavefront
 from rsbench.renderers.backend import start_backend
 from rsbench.renderers.options import Integrator, RendererOptions
 from rsbench.renderers.pixel_samples import instant_count, instant_of, instant_times
 from rsbench.renderers.render import LinePoses, render
 from rsbench.renderers.scene import MitsubaScene
-from rsbench.renderers.sensor import make_sensor
+from rsbench.renderers.sensor import LineRays, make_sensor
 from rsbench.scenes.model import Light, Material, Scene
 
 CAMERA = PinholeCamera(width=32, height=24, fx=26.0, fy=27.0, cx=14.0, cy=12.5)
@@ -69,6 +70,37 @@ def test_only_the_first_frame_compiles(scene: MitsubaScene, row_poses: Any, inte
     assert {entry["hash"] for entry in later} <= {entry["hash"] for entry in first}
 
 
+@pytest.mark.parametrize("integrator", ["sunsky", "path"])
+def test_recorded_kernels_are_replayed_with_the_bits_of_traced_ones(
+    scene: MitsubaScene, row_poses: Any, integrator: Integrator
+) -> None:
+    import drjit as dr
+
+    other = PinholeCamera(width=45, height=31, fx=30.5, fy=29.0, cx=22.1, cy=15.0)
+    frames = [(CAMERA, 4, None, 0.1), (other, 4, None, 0.3), (CAMERA, 9, [7, 3], 0.2), (CAMERA, 4, None, 0.5)]
+
+    def images() -> list[Any]:
+        found = []
+        for camera, samples, rows, speed in frames:
+            poses = LinePoses(*row_poses(camera.height, w=(speed, 0.0, 0.1), d=(0.0, speed, 0.2)))
+            options = RendererOptions(integrator=integrator, samples=samples, seed=3)
+            frame = render(scene, camera, poses, options, rows=rows)
+            found += [frame.image, frame.depth]
+        return found
+
+    replayed = images()
+    counts = {trace.__name__: recorded.n_recordings for trace, recorded in wavefront._recorded[scene].items()}
+    images()
+    assert counts == {trace.__name__: each.n_recordings for trace, each in wavefront._recorded[scene].items()}
+    dr.set_flag(dr.JitFlag.KernelFreezing, False)
+    try:
+        traced = images()
+    finally:
+        dr.set_flag(dr.JitFlag.KernelFreezing, True)
+    for replay, trace in zip(replayed, traced, strict=True):
+        np.testing.assert_array_equal(replay, trace)
+
+
 def test_plugin_and_renderer_see_the_same_scene(scene: MitsubaScene, row_poses: Any) -> None:
     """Mitsuba's render loop and film, against ours: another sampler, the same expectation."""
     import mitsuba as mi
@@ -76,7 +108,10 @@ def test_plugin_and_renderer_see_the_same_scene(scene: MitsubaScene, row_poses: 
     R, t = row_poses(24, w=(0.1, -0.1, 0.3), d=(0.2, 0.1, 0.5))
     options = RendererOptions(integrator="path", samples=1024, max_depth=3)
     ours = render(scene, CAMERA, LinePoses(R, t), options).image
-    sensor, integrator = make_sensor(CAMERA, R, t), mi.load_dict({"type": "path", "max_depth": 3})
+    sensor, integrator = (
+        make_sensor(CAMERA, LineRays.of(CAMERA, R, t)),
+        mi.load_dict({"type": "path", "max_depth": 3}),
+    )
     theirs = np.array(mi.render(scene.textured(), sensor=sensor, integrator=integrator, spp=1024))
     # Deviation of a sample is about the mean radiance (0.5), of a pixel 0.5 / 32, of the difference 1.4 times it.
     assert np.sqrt(np.mean((ours - theirs) ** 2)) < 0.03
@@ -88,7 +123,7 @@ def test_film_positions_are_half_a_pixel_beyond_pixel_coordinates(scene: Mitsuba
     import mitsuba as mi
 
     R, t = row_poses(24, w=(0.4, 0.2, -0.3), d=(0.2, 0.1, 0.5))
-    sensor = make_sensor(CAMERA, R, t)
+    sensor = make_sensor(CAMERA, LineRays.of(CAMERA, R, t))
     for x, y in ((0, 0), (31, 0), (5, 17), (31, 23)):
         position = mi.Point2f((x + 0.5) / 32, (y + 0.5) / 24)
         ray, weight = sensor.sample_ray(mi.Float(0), mi.Float(0.5), position, mi.Point2f(0.5))
@@ -118,7 +153,7 @@ def test_rays_at_every_sample_are_the_host_s(lens: Lens, shrunk: int) -> None:
     width, height, cx, cy = 640 // shrunk, 480 // shrunk, 322.0 / shrunk, 236.5 / shrunk
     camera = PinholeCamera(width=width, height=height, fx=400 / shrunk, fy=405 / shrunk, cx=cx, cy=cy, lens=lens)
     still = np.broadcast_to(np.eye(3), (height, 3, 3)), np.zeros((height, 3))
-    sensor = make_sensor(camera, *still)
+    rays = LineRays.of(camera, *still)
     rng = np.random.default_rng(0)
     low, high = np.array([-0.49, -0.49]), np.array([width - 0.51, height - 0.51])
     corners = np.array([low, high, [low[0], high[1]], [high[0], low[1]], [cx, cy]])
@@ -126,10 +161,13 @@ def test_rays_at_every_sample_are_the_host_s(lens: Lens, shrunk: int) -> None:
     pixels = pixels.astype(np.float32)
     if dr.is_jit_v(mi.Float):
         x, y = mi.Float(pixels[:, 0].copy()), mi.Float(pixels[:, 1].copy())
-        rays = sensor.lens
-        found = np.stack([np.array(each) for each in rays.coordinates(x, y, rays.pixel(x, y, True))], axis=-1)
+        lens_rays = rays.lens
+        assert lens_rays is not None
+        found = np.stack(
+            [np.array(each) for each in lens_rays.coordinates(x, y, lens_rays.pixel(x, y, True))], axis=-1
+        )
     else:
-        found = np.array([list(sensor.row_ray(x, y, 0)[1])[:2] for x, y in pixels.tolist()])
+        found = np.array([list(rays.row_ray(x, y, 0)[1])[:2] for x, y in pixels.tolist()])
     expected = camera.unproject(pixels.astype(np.float64))[:, :2]
     # What is rounded to single precision is the answer alone: half a unit in the last place. Before that a ray is
     # within 1e-8 px of its sample; 4 times that where the lens squeezes the image.
