@@ -2,7 +2,7 @@
 
 The boxes of ``render_rs_vs_gs.py``, or the meshes of a scene (``--scene castle``), in one grey, a grey sky and one
 sun, 400 x 400, 16 samples, paths of at most 4 segments, box filter, no denoiser and no adaptive sampling. The
-noise of each is the RMS difference to its own image of 1024 samples, over the mean. The time of Cycles is what 16
+noise of each is the RMS difference to its own image of 256 samples, over the mean. The time of Cycles is what 16
 samples more take, without its start and its export of the scene; ours is of the whole frame. Blender runs in a
 Python of its own:
 
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 SIZE, FOCAL, SAMPLES, SEGMENTS, GREY, SKY, SUN = 400, 360.0, 16, 4, 0.5, 0.6, 2.4
-MANY, RUNS = 1024, 3
+MANY, RUNS = 256, 3
 BOXES = "boxes"
 FLIP = (1.0, -1.0, -1.0)
 
