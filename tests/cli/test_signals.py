@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -98,7 +99,7 @@ def test_nothing_of_a_command_stays_behind() -> None:
 def test_closed_streams_change_nothing_else(streams: str, code: int) -> None:
     """A file opened later must not get the number of a closed stream, and with it whatever is printed."""
     shown = subprocess.run(
-        f"{sys.executable} -m rsbench show nosuch {streams}",
+        f"{shlex.quote(sys.executable)} -m rsbench show nosuch {streams}",
         shell=True,
         capture_output=True,
         text=True,

@@ -80,7 +80,7 @@ def test_recorded_kernels_are_replayed_with_the_bits_of_traced_ones(
     frames = [(CAMERA, 4, None, 0.1), (other, 4, None, 0.3), (CAMERA, 9, [7, 3], 0.2), (CAMERA, 4, None, 0.5)]
 
     def images() -> list[Any]:
-        found = []
+        found = list[Any]()
         for camera, samples, rows, speed in frames:
             poses = LinePoses(*row_poses(camera.height, w=(speed, 0.0, 0.1), d=(0.0, speed, 0.2)))
             options = RendererOptions(integrator=integrator, samples=samples, seed=3)
