@@ -96,6 +96,7 @@ def test_matches_of_another_scene_show_no_rotation() -> None:
     assert rotation_of_rows(stereo, TRUE) is None
 
 
+@pytest.mark.slow
 def test_a_loose_calibration_is_found_within_the_stated_deviations() -> None:
     scores = []
     for seed in range(12):
@@ -134,6 +135,7 @@ def _vertical_window(seed: int) -> tuple[Motion, Correspondences, StereoRig]:
     return motion, Correspondences(tracks=tracks), with_errors(VERTICAL, errors)
 
 
+@pytest.mark.slow
 def test_cameras_one_above_the_other_correct_their_calibration_by_tracks() -> None:
     """Both read a point at different times, so that rows show no rotation; the true calibration stays as it is."""
     assert not VERTICAL.rows_together(Scanning(), 0.8)

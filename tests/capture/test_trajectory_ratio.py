@@ -28,6 +28,7 @@ def test_a_sequence_shows_the_ratio_that_its_windows_do_not() -> None:
     assert found.sigma < 0.03  # frames that allow no more would be no use
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 4, 6, 12])
 def test_a_dashboard_that_moves_with_the_camera_does_not_bias_the_ratio(seed: int) -> None:
     """The lower third of the image shows a dashboard, which vibrates by 0.4 px between frames.
@@ -50,6 +51,7 @@ def test_a_dashboard_that_moves_with_the_camera_does_not_bias_the_ratio(seed: in
     assert found is not None and abs(found.ratio - RATIO) < 2.5 * found.sigma and found.sigma < 0.08
 
 
+@pytest.mark.slow
 def test_an_unknown_principal_point_does_not_bias_the_ratio() -> None:
     """With the assumed one, 18 px beside the true one, the ratio is 0.763 +- 0.023; 0.8 is true."""
     rng = np.random.default_rng(25)

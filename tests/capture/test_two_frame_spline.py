@@ -218,6 +218,7 @@ def test_a_readout_ratio_of_two_shaken_frames_is_not_told() -> None:
         assert not answer["success"] and "cannot tell" in answer["reason"] and answer["w"] is None
 
 
+@pytest.mark.slow
 def test_where_no_law_holds_for_all_rows_any_ratio_is_as_likely() -> None:
     for seed in (0, 1):
         rng = np.random.default_rng(seed)

@@ -53,6 +53,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_listing_names_them(site: Path) -> None:
     result = run_apart("list", "solvers", "--json", path=site, RSBENCH_IMPORT_LIMIT_S="4")
     assert result.returncode == 0, result.stderr

@@ -186,6 +186,7 @@ def test_a_sequence_of_folders(tmp_path: Path, frames: list[Path], rig: Path) ->
     assert not video.read()[0] and (tmp_path / "film.json").is_file()
 
 
+@pytest.mark.slow
 def test_frames_that_the_motion_does_not_explain_are_named(
     tmp_path: Path, frames: list[Path], rig: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

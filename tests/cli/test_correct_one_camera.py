@@ -66,6 +66,7 @@ def _moments(
     return list(correct_frames(frames, PinholeCamera.centred(width, height, 160.0), shutter, options))
 
 
+@pytest.mark.slow
 def test_two_frames_become_upright(folder: Path) -> None:
     result = _correct(folder, folder / "0.png", folder / "1.png")
     assert result.returncode == 0, result.stderr

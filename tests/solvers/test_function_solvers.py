@@ -124,6 +124,7 @@ def test_the_motion_of_exact_data_is_the_true_one(folder: Path) -> None:
     assert not found.metric and load_solver_entry("by_function.py").description == "Eight points."
 
 
+@pytest.mark.slow
 def test_commands_take_the_file(folder: Path) -> None:
     (folder / "sweep.toml").write_text(sweep_card(["gs-8pt"], noise_px=[0.2], trials=8), "utf-8")
     problem = Path(__file__).parents[2] / "examples" / "problem.json"

@@ -286,6 +286,7 @@ def test_flow_counts_against_a_motion_only_where_the_images_agree_with_it(period
     assert found > 0.93 if period else found < 0.02
 
 
+@pytest.mark.slow
 def test_the_explained_share_of_the_flow_shows_a_wrong_motion(worlds: tuple[Any, Any], u8: Any) -> None:
     """The right motion explains nearly all flow beside the ball, and a wrong one hardly any."""
     wall = worlds[0]
@@ -320,6 +321,7 @@ def test_a_thing_whose_static_place_is_outside_the_frame_goes_its_own_flow(
     assert errors[1] < 0.5 * errors[0]
 
 
+@pytest.mark.slow
 def test_what_passes_before_a_plain_wall_does_not_set_it_in_motion(world: Build, shapes: Any, u8: Any) -> None:
     """Flow runs from an edge into what has no texture, and fits there: the edge hides where geometry leads."""
     plane, sphere = shapes

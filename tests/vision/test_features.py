@@ -274,6 +274,7 @@ def test_what_cannot_be_aligned_stays(levels: float | None) -> None:
     np.testing.assert_array_equal(found, places)
 
 
+@pytest.mark.slow
 def test_a_track_stays_one_in_all_sets() -> None:
     images: dict[View, NDArray[np.uint8]] = {
         (side, frame): _image(np.eye(2), np.array([-1.5 * (side == "right") + 0.7 * frame, 0.4 * frame]))

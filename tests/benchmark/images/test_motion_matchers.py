@@ -53,6 +53,7 @@ def test_depth_is_found_with_the_motion_of_the_solver_and_scored(smoke_dataset: 
     assert rows["psnr"].mean() > before + 3.0
 
 
+@pytest.mark.slow
 def test_another_packages_matcher_gets_the_motion_in_a_process_of_its_own(
     smoke_dataset: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -259,6 +259,7 @@ def test_cards_say_what_they_use(card: str, uses: tuple[str, ...]) -> None:
     assert uses_of(load_solver_entry(card)) == uses
 
 
+@pytest.mark.slow
 def test_what_is_not_there_leaves_no_folder(tmp_path: Path) -> None:
     board = tmp_path / "board"
     assert_refused(run_here("leaderboard", "run", "points", "--entry", "nobody", "--board", board), "'nobody'")

@@ -304,6 +304,7 @@ def signed(clone: Path, head: str, secret: Path, line: str, namespace: str = "rs
     return commit(clone, head, {f"submissions/{line.split()[0]}/update.sig".encode(): ran.stdout})
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("ssh-keygen") is None, reason="no OpenSSH")
 def test_the_key_of_an_entry_signs_its_updates(board: Path, tmp_path: Path) -> None:
     mine, other = key(tmp_path, "mine"), key(tmp_path, "other")

@@ -147,6 +147,7 @@ def test_the_score_is_that_of_the_protocol(split: Split, tmp_path: Path) -> None
     assert (last["near_bound"], last["near_R"], last["near_T"], last["failure"]) == (0.0, 0.0, 0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_who_chooses_a_law_is_nearer_under_another(tmp_path: Path) -> None:
     """Of a problem under another law than the solver's own."""
     number = next(n for n in range(240) if POINTS_2.kinds(1, n) == {"motion": "inertial", "rig": "drone"})

@@ -110,6 +110,7 @@ def test_recordings_of_ones_own(tmp_path: Path) -> None:
     assert list(scores["chosen"]) == [answer["motion_model"] for answer in answers]
 
 
+@pytest.mark.slow
 def test_one_command_makes_the_boards_and_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two windows of each recording, and of one's own copy of the drone where it is there."""
     monkeypatch.setattr(recorded, "OF_A_RECORDING", 2)
@@ -138,6 +139,7 @@ def test_one_command_makes_the_boards_and_the_page(tmp_path: Path, monkeypatch: 
     assert len(chosen) == 8 and (chosen["departure_px"] > 0.0).all()
 
 
+@pytest.mark.slow
 def test_an_announced_split_is_run_beside_the_public_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two windows of each recording; another text, or another split, is not what was announced."""
     monkeypatch.setattr(recorded, "OF_A_RECORDING", 2)

@@ -250,6 +250,7 @@ OF_RIG = Setting(
 )
 
 
+@pytest.mark.slow
 def test_a_sweep_of_rigs_is_at_their_bounds_and_read_again(tmp_path: Path) -> None:
     """A global camera above one that rolls, 6 cm apart: what moves in between hides their disparity."""
     zed = Variant(name="zed2", setting={"rig_card": "zed2"})

@@ -72,6 +72,7 @@ def test_unobservable_scale_hides_scale_alone() -> None:
     assert row["unobservable"] == "scale" and row["e_s_median"] is None and row["e_T_median"] < 1e-9
 
 
+@pytest.mark.slow
 def test_quotient_of_errors_at_the_bound_is_one() -> None:
     rng = np.random.default_rng(1)
     sigmas = rng.uniform(0.5, 2.0, 4000)
