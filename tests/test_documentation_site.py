@@ -70,6 +70,7 @@ def test_a_section_says_of_each_of_its_pages_what_it_is_for() -> None:
         assert set(_children(page)) <= linked, page
 
 
+@pytest.mark.slow
 def test_every_public_name_is_in_the_reference(site: Path) -> None:
     page = (site / "reference" / "python.html").read_text("utf-8")
     assert [name for name in rsbench.__all__ if f'id="rsbench.{name}"' not in page] == []
@@ -80,6 +81,7 @@ def _own(site: Path) -> list[Path]:
     return [path for path in site.rglob("*.html") if path.relative_to(site).parts[0] != "boards"]
 
 
+@pytest.mark.slow
 def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
     for page in _own(site):
         text = page.read_text("utf-8")
@@ -87,6 +89,7 @@ def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
             assert marker not in text, f"{page.name}: {marker}"
 
 
+@pytest.mark.slow
 def test_links_and_their_anchors_lead_somewhere(site: Path) -> None:
     pages = {path.resolve(): path.read_text("utf-8") for path in _own(site)}
     ids = {path: set(map(unescape, re.findall(r'\sid="([^"]+)"', text))) for path, text in pages.items()}
@@ -109,6 +112,7 @@ def _boards(site: Path) -> list[str]:
     return [first, *re.findall(r'href="([^"]+)" target="board"', text)]
 
 
+@pytest.mark.slow
 def test_every_board_of_frames_and_points_opens_in_the_page_of_the_boards(site: Path) -> None:
     found = _boards(site)
     assert {each.split("/")[1] for each in found} == {"laws", "leaderboard", "footage", "handheld"}
@@ -173,6 +177,7 @@ def test_a_board_fits_its_frame(site: Path, page: Browser, width: int) -> None:
 
 
 @pytest.mark.parametrize("width", [PHONE, DESKTOP])
+@pytest.mark.slow
 def test_the_front_page_has_four_doors_that_open(site: Path, page: Browser, width: int) -> None:
     page.appear(width=width)
     page.open((site / "index.html").as_uri())
@@ -192,6 +197,7 @@ def test_the_front_page_has_four_doors_that_open(site: Path, page: Browser, widt
         assert page.run("document.querySelector('h1').textContent").startswith(shown[door][0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "wanted"),
     [
