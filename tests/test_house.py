@@ -334,8 +334,8 @@ def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
 
 
 OLDER = {
-    *("claims", "correction", "fig3", "footage", "gyro", "handheld", "held-out", "images", "leaderboard", "r6p"),
-    *("readings", "real", "recorded", "rectify", "solvers", "speed", "sweeps", "trajectory", "tuning"),
+    *("correction", "footage", "gyro", "handheld", "held-out", "leaderboard", "r6p", "real", "recorded", "rectify"),
+    *("solvers", "trajectory", "tuning"),
 }
 """Folders of results with files that code before 1.1 made; empty when 1.1 is released."""
 
