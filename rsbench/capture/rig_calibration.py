@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri  # scipy.stats takes a second to load
+import scipy  # loads scipy.special at its first use
 
 from rsbench.components.motion_models import make_motion
 from rsbench.core import so3
@@ -132,7 +132,7 @@ def contradict(errors: FloatArray, covariance: FloatArray) -> bool:
     """
     free = np.flatnonzero(np.diagonal(covariance) > 0.0)
     inverse = np.linalg.pinv(covariance[np.ix_(free, free)], hermitian=True)
-    return float(errors[free] @ inverse @ errors[free]) > float(chdtri(len(free), _CHANCE))
+    return float(errors[free] @ inverse @ errors[free]) > float(scipy.special.chdtri(len(free), _CHANCE))
 
 
 def with_errors(rig: StereoRig, errors: FloatArray) -> StereoRig:
