@@ -223,9 +223,9 @@ class _Run:
         with background_writer() as later:
             for side, frame in views_of(card.frames):
                 yield from render_camera(card, sequence, self.options, mitsuba_scene, side, frame, partial, later)
-            write_sequence_channels(
-                card.channels, sequence_truth(partial, card, sequence, mitsuba_scene, plan["scene"])
-            )
+        write_sequence_channels(
+            card.channels, sequence_truth(partial, card, sequence, mitsuba_scene, plan["scene"])
+        )
         files = {name: sha256(partial / name) for name in files_below(partial)}
         made_by = {
             "rsbench": __version__,
@@ -295,19 +295,19 @@ def render_camera(
                 f"{sequence.viewpoint!r} of scene {sequence.scene}, or the motion"
             )
         clean = clean_file(side, frame) if kind == "rs" and sensor else view.image
-        write_png(folder / clean, to_srgb8(rendered.image, options.exposure))
-        write_depth(folder / view.depth, rendered.depth)
+        later(write_png, folder / clean, to_srgb8(rendered.image, options.exposure))
+        later(write_depth, folder / view.depth, rendered.depth)
         if things:
-            write_png(folder / view.labels, rendered.labels)
+            later(write_png, folder / view.labels, rendered.labels)
         if scene.glossy:
-            write_mask(folder / view.gloss, rendered.gloss)
+            later(write_mask, folder / view.gloss, rendered.gloss)
         if kind == "rs" and sensor:
             own, period = sensor.of(side, frame), card.period_of(sequence)
-            write_png(folder / view.image, sensed_rows(scene, geometry, (side, frame), own, period, options))
+            later(write_png, folder / view.image, sensed_rows(scene, geometry, (side, frame), own, period, options))
         if kind == "gs" and sensor and card.exposed_twins:
             own, period = sensor.of(side, frame).noiseless, card.period_of(sequence)
             exposed = sensed_rows(scene, geometry, (side, frame), own, period, options, twin=view.row)
-            write_png(folder / view.exposed, exposed)
+            later(write_png, folder / view.exposed, exposed)
         if kind == "rs":
             write_channels(folder, card.channels, geometry, view, rendered, SceneRays(scene, things), later, twins)
         if view.row == 0:
