@@ -334,8 +334,8 @@ def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
 
 
 OLDER = {
-    *("correction", "footage", "gyro", "handheld", "held-out", "r6p", "real", "recorded", "rectify"),
-    *("solvers", "trajectory", "tuning"),
+    *("correction", "footage", "handheld", "held-out", "real", "recorded", "rectify"),
+    *("trajectory", "tuning"),
 }
 """Folders of results with files that code before 1.1 made; empty when 1.1 is released."""
 

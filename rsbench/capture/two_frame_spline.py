@@ -176,7 +176,8 @@ class Departure(NamedTuple):
     """By how much a motion may depart from the motion model under which it was estimated."""
 
     scatter: float = 1.0
-    """Variance of the motions that fit groups of rows best over that of errors common to a tile, at least 1."""
+    """Variance of the motions that fit groups of rows best over that of errors common to a tile, which include the
+    shifts that ``core.uncertainty`` assumes, at least 1."""
     covariance: FloatArray | float = 0.0
     """(6, 6) covariance of w and d due to shakes."""
 
@@ -204,8 +205,8 @@ def departure(matches: Correspondences, rig: StereoRig, shutter: RollingShutter,
     if tailed is None or theta is None:
         return Departure()
     stated, rows = tailed.stated(theta), tailed.by_rows(theta)
-    shared = 1.0 if stated is None else stated.shared
-    scatter = 1.0 if rows is None else max(1.0, rows.square / rows.freedom / shared)
+    shared, by_shifts = (1.0, 1.0) if stated is None else (stated.shared, stated.by_shifts)
+    scatter = 1.0 if rows is None else max(1.0, rows.square / rows.freedom / (shared * by_shifts))
     tracks = pack_windows([window], rig, shutter, share=1.0 / shared)
     curve, tails = approximated(law.body_from_world, span_of(1, shutter), _KNOTS), Tails(tailed.nu, tailed.scale)
     reach = tracks.freedom * (REACH * tails.scale) ** 2

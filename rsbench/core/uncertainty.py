@@ -80,6 +80,15 @@ class Stated:
     shifted: FloatArray | float = 0.0
     """(p, p) contribution of ``common_shifts``."""
 
+    @property
+    def by_shifts(self) -> float:
+        """Mean ratio of the variance with ``common_shifts`` to that without; at least 1."""
+        if not np.any(self.shifted):
+            return 1.0
+        size = np.sqrt(np.diagonal(self.covariance))
+        whole, shifted = (each / np.outer(size, size) for each in (self.covariance, np.asarray(self.shifted)))
+        return 1.0 + float(np.trace(np.linalg.pinv(whole - shifted, hermitian=True) @ shifted)) / len(size)
+
 
 def stated_covariance(
     gradients: FloatArray,
@@ -133,9 +142,8 @@ def shrunk(shares: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
     """Return the shrunk covariance (p, p) of a sum of independent shares (n, p), and the shrinkage factor r.
 
     In units in which ``target`` is the identity, the second moments S of the shares are shrunk towards a multiple
-    of
-    the identity: mu I + r (S - mu I), mu = tr S / p. The factor r minimises the expected squared distance to the
-    truth.
+    of the identity: mu I + r (S - mu I), mu = tr S / p. The factor r minimises the expected squared distance to
+    the truth.
     """
     size = np.sqrt(np.diagonal(target))
     half = size[:, None] * np.linalg.cholesky(target / np.outer(size, size))

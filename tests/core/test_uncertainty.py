@@ -121,3 +121,10 @@ def test_common_shifts_of_tiles_are_covered_where_plain_deviations_are_a_third()
     expected = 0.01 * inverse + added
     np.testing.assert_allclose(np.cov(np.transpose(errors)), expected, atol=0.06 * np.max(expected))
     assert np.all(u.common_shifts(X[None] @ inverse, groups, sigma_px=1e-3) < 1e-2 * np.abs(added) + 1e-12)
+
+
+def test_shifts_widen_by_their_mean_share_of_the_other_variance() -> None:
+    shifted = np.diag([1.0, 3e-6])
+    stated = u.Stated(np.diag([2.0, 2e-6]) + shifted, shifted=shifted)
+    assert stated.by_shifts == pytest.approx(1.0 + (0.5 + 1.5) / 2.0)
+    assert u.Stated(np.eye(2)).by_shifts == 1.0
