@@ -303,7 +303,9 @@ def render_camera(
             later(write_mask, folder / view.gloss, rendered.gloss)
         if kind == "rs" and sensor:
             own, period = sensor.of(side, frame), card.period_of(sequence)
-            later(write_png, folder / view.image, sensed_rows(scene, geometry, (side, frame), own, period, options))
+            later(
+                write_png, folder / view.image, sensed_rows(scene, geometry, (side, frame), own, period, options)
+            )
         if kind == "gs" and sensor and card.exposed_twins:
             own, period = sensor.of(side, frame).noiseless, card.period_of(sequence)
             exposed = sensed_rows(scene, geometry, (side, frame), own, period, options, twin=view.row)
