@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -99,6 +100,29 @@ def test_recorded_kernels_are_replayed_with_the_bits_of_traced_ones(
         dr.set_flag(dr.JitFlag.KernelFreezing, True)
     for replay, trace in zip(replayed, traced, strict=True):
         np.testing.assert_array_equal(replay, trace)
+
+
+def test_recordings_of_a_scene_outlive_those_of_others(town: Any, row_poses: Any) -> None:
+    """Dr.Jit numbers the surfaces of all scenes together, and gives the numbers of a scene that is gone again."""
+    if start_backend().variant == "scalar_rgb":
+        pytest.skip("kernels are recorded with LLVM")
+    poses = LinePoses(*row_poses(CAMERA.height, w=(0.1, 0.0, 0.1), d=(0.0, 0.1, 0.2)))
+
+    def image(scene: MitsubaScene, integrator: Integrator = "sunsky") -> Any:
+        return render(scene, CAMERA, poses, RendererOptions(integrator=integrator, samples=4)).image
+
+    kept, others = (
+        MitsubaScene(town),
+        [replace(town, meshes=town.meshes[::-1]), replace(town, meshes=town.meshes[:2])],
+    )
+    first = image(kept)
+    for other in others:
+        fresh = image(MitsubaScene(other))
+        gc.collect()
+        between = MitsubaScene(other)
+        image(between, "path")  # replaces the materials
+        np.testing.assert_array_equal(image(between), fresh)
+        np.testing.assert_array_equal(image(kept), first)
 
 
 def test_plugin_and_renderer_see_the_same_scene(scene: MitsubaScene, row_poses: Any) -> None:
