@@ -286,7 +286,10 @@ def _path_band(
 
     The samples are split into passes, but summed in the same order for any number of passes.
     """
-    scene.textured(), path_integrator(options.max_depth), lane_sampler()  # no recording contains their loading
+    # Loading within a recording would change its kernel, so all is loaded before.
+    scene.textured()
+    path_integrator(options.max_depth)
+    lane_sampler()
     samples = _Samples.of(rays, options)
     count = len(rows) * _padded(camera.width)
     per_pass = max(1, _most_lanes() // count)

@@ -111,12 +111,9 @@ def test_recordings_of_a_scene_outlive_those_of_others(town: Any, row_poses: Any
     def image(scene: MitsubaScene, integrator: Integrator = "sunsky") -> Any:
         return render(scene, CAMERA, poses, RendererOptions(integrator=integrator, samples=4)).image
 
-    kept, others = (
-        MitsubaScene(town),
-        [replace(town, meshes=town.meshes[::-1]), replace(town, meshes=town.meshes[:2])],
-    )
+    kept = MitsubaScene(town)
     first = image(kept)
-    for other in others:
+    for other in (replace(town, meshes=town.meshes[::-1]), replace(town, meshes=town.meshes[:2])):
         fresh = image(MitsubaScene(other))
         gc.collect()
         between = MitsubaScene(other)
@@ -132,10 +129,8 @@ def test_plugin_and_renderer_see_the_same_scene(scene: MitsubaScene, row_poses: 
     R, t = row_poses(24, w=(0.1, -0.1, 0.3), d=(0.2, 0.1, 0.5))
     options = RendererOptions(integrator="path", samples=1024, max_depth=3)
     ours = render(scene, CAMERA, LinePoses(R, t), options).image
-    sensor, integrator = (
-        make_sensor(CAMERA, LineRays.of(CAMERA, R, t)),
-        mi.load_dict({"type": "path", "max_depth": 3}),
-    )
+    sensor = make_sensor(CAMERA, LineRays.of(CAMERA, R, t))
+    integrator = mi.load_dict({"type": "path", "max_depth": 3})
     theirs = np.array(mi.render(scene.textured(), sensor=sensor, integrator=integrator, spp=1024))
     # Deviation of a sample is about the mean radiance (0.5), of a pixel 0.5 / 32, of the difference 1.4 times it.
     assert np.sqrt(np.mean((ours - theirs) ** 2)) < 0.03
