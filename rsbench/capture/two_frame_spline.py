@@ -84,8 +84,8 @@ _DEPTHS = 3.0
 """Depth is observed if the median disparity exceeds this many of its standard deviations."""
 _APART = 6.0
 """Two splines are the same if the sum of squared normalised differences of the six parameters is below this."""
-_MEDIAN = 4.35
-"""Median of chi-squared with five degrees of freedom."""
+_MEDIAN = 0.87
+"""Median of chi-squared with five degrees of freedom, divided by five."""
 _SHARE, _SHARE_OF_VIDEO = 0.15, 0.5
 """Weight of a track relative to the prior, and in the covariance, for two frames and for more. Two frames hardly
 determine rotations that are the same during both readouts: with a larger weight, correlated errors of a tenth of a
@@ -194,7 +194,7 @@ def departure(matches: Correspondences, rig: StereoRig, shutter: RollingShutter,
     covariance of w and d under each departure, and to its evidence (Laplace's approximation, with the likelihood
     where the step ends: two frames hardly determine rotations that are the same during both readouts, so steps may
     lead far off). The result is the covariance of their mixture about the model's motion, beyond that without a
-    departure. Fewer than 30 tracks show nothing.
+    departure. Fewer than 30 tracks and pairs show nothing.
 
     Args:
         law: see ``two_frame_spline``.
@@ -267,12 +267,16 @@ def _needs_spline(window: Correspondences, rig: StereoRig, shutter: RollingShutt
 def _under_law(
     window: Correspondences, rig: StereoRig, shutter: RollingShutter, law: Motion
 ) -> HeavyTailed | None:
-    """The tracks with the distribution of their errors; None if there are few or the model has no kernel."""
-    if len(window.tracks) < _FEWEST or not has_kernel(law.name):
+    """The tracks with the distribution of their errors, and the pairs if there are few tracks; None if there are
+    few of both or the model has no kernel."""
+    if not has_kernel(law.name):
         return None
-    packed = pack(Correspondences(tracks=window.tracks), rig, shutter, law.name, motion_parameters=law.parameters)
+    matches = Correspondences(tracks=window.tracks) if len(window.tracks) >= _FEWEST else window
+    packed = pack(matches, rig, shutter, law.name, motion_parameters=law.parameters)
+    if len(packed.freedom) < _FEWEST:
+        return None
     theta = packed.theta(law.w, law.d)
-    squares = each_term(packed, theta).squares
+    squares = each_term(packed, theta).squares / packed.freedom
     return heavy_tailed(packed, theta, max(float(np.sqrt(np.median(squares) / _MEDIAN)), LEAST_SCALE_PX))
 
 
