@@ -86,37 +86,59 @@ def connect(rho: F32, limit: F64) -> U8:
     return joined
 
 
+Vector = tuple[float, float, float]
+LineMap = tuple[Vector, Vector, Vector, Vector]
+"""The rows of M of one line, and its b."""
+
+
 @compiled(error_model="numpy", inline="always")
-def move(maps: LineMaps, columns: bool, x: int, y: int, rho: float) -> tuple[float, float, float]:
-    """Target pixel and inverse depth of a source pixel; NaN behind the target camera or where rho is NaN."""
-    M, b, line = maps.M, maps.b, line_of(columns, x, y)
+def line_map(maps: LineMaps, line: int) -> LineMap:
+    """The map of one line. A loop over a row's pixels that loads it before is compiled to vector instructions."""
+    M, b = maps.M, maps.b
+    return (
+        (M[line, 0, 0], M[line, 0, 1], M[line, 0, 2]),
+        (M[line, 1, 0], M[line, 1, 1], M[line, 1, 2]),
+        (M[line, 2, 0], M[line, 2, 1], M[line, 2, 2]),
+        (b[line, 0], b[line, 1], b[line, 2]),
+    )
+
+
+@compiled(error_model="numpy", inline="always")
+def move_by(line: LineMap, maps: LineMaps, x: int, y: int, rho: float) -> Vector:
+    """``move`` by the map of the pixel's line."""
+    A, B, C, b = line
     gx, gy = look(maps.ideal, x, y)
-    z = M[line, 2, 0] * gx + M[line, 2, 1] * gy + M[line, 2, 2] + rho * b[line, 2]
+    z = C[0] * gx + C[1] * gy + C[2] + rho * b[2]
     s = 1.0 / z if z > 0.0 else np.nan
-    u = M[line, 0, 0] * gx + M[line, 0, 1] * gy + M[line, 0, 2] + rho * b[line, 0]
-    v = M[line, 1, 0] * gx + M[line, 1, 1] * gy + M[line, 1, 2] + rho * b[line, 1]
+    u = A[0] * gx + A[1] * gy + A[2] + rho * b[0]
+    v = B[0] * gx + B[1] * gy + B[2] + rho * b[1]
     px, py = see(maps.lens, u * s, v * s)
     return px, py, rho * s
+
+
+@compiled(error_model="numpy", inline="always")
+def move(maps: LineMaps, x: int, y: int, rho: float) -> Vector:
+    """Target pixel and inverse depth of a source pixel; NaN behind the target camera or where rho is NaN."""
+    return move_by(line_map(maps, line_of(maps.columns, x, y)), maps, x, y, rho)
 
 
 @compiled(error_model="numpy")
 def move_pixels(rho: F32, maps: LineMaps, moved: F64) -> None:
     """Fill ``moved`` (3, H, W) with target x, y and inverse depth of every source pixel centre."""
-    height, width = rho.shape
-    for y in range(height):
-        for x in range(width):
-            moved[0, y, x], moved[1, y, x], moved[2, y, x] = move(maps, maps.columns, x, y, rho[y, x])
+    for y in range(rho.shape[0]):
+        move_row(maps, y, rho, moved[:, y])
 
 
-@compiled(error_model="numpy", inline="always")
-def _move_row(maps: LineMaps, y: int, rho: F32, out: F64) -> None:
-    """``move`` of a row of pixels into ``out`` (W, 3)."""
+@compiled(error_model="numpy")
+def move_row(maps: LineMaps, y: int, rho: F32, out: F64) -> None:
+    """``move`` of a row of pixels into ``out`` (3, W)."""
     if maps.columns:
         for x in range(rho.shape[1]):
-            out[x, 0], out[x, 1], out[x, 2] = move(maps, True, x, y, rho[y, x])
-    else:  # separate function, so that the row's map is loaded once
+            out[0, x], out[1, x], out[2, x] = move_by(line_map(maps, x), maps, x, y, rho[y, x])
+    else:
+        line = line_map(maps, y)
         for x in range(rho.shape[1]):
-            out[x, 0], out[x, 1], out[x, 2] = move(maps, False, x, y, rho[y, x])
+            out[0, x], out[1, x], out[2, x] = move_by(line, maps, x, y, rho[y, x])
 
 
 @compiled(error_model="numpy")
@@ -126,12 +148,12 @@ def draw_mesh(rho: F32, joined: U8, maps: LineMaps, source_map: F32, buffer: F32
     ``buffer`` holds inverse depth at the target, -1 where nothing is drawn yet; the larger value wins.
     """
     height, width = rho.shape
-    rows = np.zeros((2, width, 3))
+    rows = np.zeros((2, 3, width))
     for y in range(height):
         upper, lower = rows[(y + 1) & 1], rows[y & 1]
-        _move_row(maps, y, rho, lower)
+        move_row(maps, y, rho, lower)
         if y > 0:
-            _draw_strip(upper, lower, joined, y, source_map, buffer)
+            _draw_strip(upper.T, lower.T, joined, y, source_map, buffer)
 
 
 @compiled(error_model="numpy", inline="always")
@@ -242,12 +264,12 @@ def _cell(
     height, width = buffer.shape
     own_height, own_width = rho.shape
     columns = maps.columns
-    ax, ay, az = move(maps, columns, x, y, rho[y, x])
+    ax, ay, az = move(maps, x, y, rho[y, x])
     # The next line has another pose, also at the last one, whose next neighbour does not exist. A row's goes on.
     right = -1 if x + 1 == own_width and (columns or maps.ideal is not None) else 1
-    bx, by, bz = move(maps, columns, x + right, y, rho[y, x] + right * along[0])
+    bx, by, bz = move(maps, x + right, y, rho[y, x] + right * along[0])
     step = 1 if y + 1 < own_height else -1
-    cx, cy, cz = move(maps, columns, x, y + step, rho[y, x] + step * along[1])
+    cx, cy, cz = move(maps, x, y + step, rho[y, x] + step * along[1])
     ux, uy, uz = right * (bx - ax), right * (by - ay), right * (bz - az)
     vx, vy, vz = step * (cx - ax), step * (cy - ay), step * (cz - az)
     scale = 1.0 / (ux * vy - uy * vx)

@@ -335,7 +335,7 @@ def _keep_landing(
         for x in range(depth.shape[1]):
             if np.isnan(rho[y, x]):
                 continue
-            u, v, _ = move(maps, maps.columns, x, y, rho[y, x])
+            u, v, _ = move(maps, x, y, rho[y, x])
             u, v = u + 0.5, v + 0.5
             if 0.0 <= u < width and 0.0 <= v < height and wanted[int(v), int(u)] != 0:  # NaN is outside
                 kept[y, x] = depth[y, x]

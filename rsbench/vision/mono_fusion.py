@@ -30,12 +30,14 @@ from rsbench.core.so3 import FloatArray
 from rsbench.vision.correction import (
     BELOW,
     RIGHT,
+    LineMap,
     WarpOptions,
     draw_joined,
     joined_inside,
     joined_within,
+    line_map,
     line_maps,
-    move,
+    move_by,
 )
 from rsbench.vision.epipolar_search import (
     SweepOptions,
@@ -351,25 +353,32 @@ def _place(
     rho: F32,
     weight: F32,
     maps: LineMaps | None,
-    ahead: FloatArray,
+    line: LineMap | None,
+    ahead: float,
     period: float,
     rate: float,
 ) -> tuple[float, float, float]:
     """Target x, y, px, and inverse depth there, of a pixel: the mean of its places by scaled flow, with ``weight``
-    (H, W), and by ``maps``; scaled flow alone if there are no maps.
+    (H, W), and by the map of its line; scaled flow alone if there is no map.
 
-    ``ahead`` (H,) is the time from each row to the target. Each row takes the time ``rate``, so the time that
+    ``ahead`` is the time from the pixel's row to the target. Each row takes the time ``rate``, so the time that
     passes along the flow is linear in the flow; if none passes, there is no speed, and the pixel stays.
     """
     passed = period + flow[y, x, 1] * rate
-    share = ahead[y] / passed if abs(passed) > 1e-3 else 0.0
+    share = ahead / passed if abs(passed) > 1e-3 else 0.0
     u, v, s = x + share * flow[y, x, 0], y + share * flow[y, x, 1], float(rho[y, x])
     if maps is not None:
-        of_flow, moved = float(weight[y, x]), move(maps, maps.columns, x, y, rho[y, x])
+        of_flow, moved = float(weight[y, x]), move_by(line, maps, x, y, rho[y, x])
         u = of_flow * u + (1.0 - of_flow) * moved[0]
         v = of_flow * v + (1.0 - of_flow) * moved[1]
         s = of_flow * s + (1.0 - of_flow) * moved[2]
     return u, v, s
+
+
+@compiled(error_model="numpy")
+def _row_map(maps: LineMaps | None, y: int) -> LineMap | None:
+    """The map of a row."""
+    return None if maps is None else line_map(maps, y)
 
 
 @compiled(error_model="numpy")
@@ -384,13 +393,16 @@ def _fill_places(
     drawn: Mask,
     places: FloatArray,
 ) -> None:
-    """Fill ``places`` (H, W, 3) of the pixels in ``drawn`` (H, W)."""
+    """Fill ``places`` (H, W, 3) of the pixels in ``drawn`` (H, W); ``ahead`` (H,) is the time from each row."""
     height, width = rho.shape
+    row = np.zeros((3, width), dtype=np.float32)
     for y in range(height):
+        line, time = _row_map(maps, y), ahead[y]
+        for x in range(width):
+            row[0, x], row[1, x], row[2, x] = _place(x, y, flow, rho, weight, maps, line, time, period, rate)
         for x in range(width):
             if drawn[y, x]:
-                u, v, s = _place(x, y, flow, rho, weight, maps, ahead, period, rate)
-                places[y, x, 0], places[y, x, 1], places[y, x, 2] = u, v, s
+                places[y, x, 0], places[y, x, 1], places[y, x, 2] = row[0, x], row[1, x], row[2, x]
 
 
 @compiled(error_model="numpy")
@@ -411,7 +423,7 @@ def _mark_blocks(
     for i in range(rows):
         for j in range(columns):
             y, x = min(i * _BLOCK + _BLOCK // 2, height - 1), min(j * _BLOCK + _BLOCK // 2, width - 1)
-            u, v, _ = _place(x, y, flow, rho, weight, maps, ahead, period, rate)
+            u, v, _ = _place(x, y, flow, rho, weight, maps, _row_map(maps, y), ahead[y], period, rate)
             if abs(u) < 1e9 and abs(v) < 1e9:
                 column = min(max(int(u) // _BLOCK, 0), columns - 1)
                 chosen[i, j] = near[min(max(int(v) // _BLOCK, 0), rows - 1), column]
