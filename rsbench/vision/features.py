@@ -259,7 +259,7 @@ def _sample(image: F32, x: float, y: float) -> np.float32:
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def _template(image: F32, x: float, y: float, grid: F32, J: F32) -> None:
-    """Derivatives (n, 8) of the patch's grey levels by the parameters; the last two are 1 and the levels."""
+    """Derivatives (8, n) of the patch's grey levels by the parameters; the last two are 1 and the levels."""
     size = 2 * _HALF + 3
     for j in range(size):
         for i in range(size):
@@ -269,8 +269,8 @@ def _template(image: F32, x: float, y: float, grid: F32, J: F32) -> None:
         for i in range(1, size - 1):
             gx, gy = half * (grid[j, i + 1] - grid[j, i - 1]), half * (grid[j + 1, i] - grid[j - 1, i])
             u, v = np.float32(i - _HALF - 1), np.float32(j - _HALF - 1)
-            J[k, 0], J[k, 1], J[k, 2], J[k, 3], J[k, 4], J[k, 5] = gx, gy, gx * u, gx * v, gy * u, gy * v
-            J[k, 6], J[k, 7] = np.float32(1.0), grid[j, i]
+            J[0, k], J[1, k], J[2, k], J[3, k], J[4, k], J[5, k] = gx, gy, gx * u, gx * v, gy * u, gy * v
+            J[6, k], J[7, k] = np.float32(1.0), grid[j, i]
             k += 1
 
 
@@ -288,7 +288,7 @@ def _align_all(
     size = 2 * _HALF + 1
     grid, J = (
         np.zeros((size + 2, size + 2), dtype=np.float32),
-        np.zeros((size * size, _PARAMETERS), dtype=np.float32),
+        np.zeros((_PARAMETERS, size * size), dtype=np.float32),
     )
     weights = np.zeros(size * size)
     for k in range(size * size):
@@ -313,28 +313,28 @@ def _align(
     covariance: FloatArray,
 ) -> bool:
     """Move one place (2,) to the best fit of the patch; return False, without a move, if there is none."""
-    count = len(J)
-    H = np.zeros((_PARAMETERS, _PARAMETERS))
-    for k in range(count):
-        for p in range(_PARAMETERS):
-            for q in range(p + 1):
-                H[p, q] += weights[k] * J[k, p] * J[k, q]
+    H, row = np.zeros((_PARAMETERS, _PARAMETERS)), np.zeros(J.shape[1])
     for p in range(_PARAMETERS):
+        for k in range(len(row)):
+            row[k] = weights[k] * J[p, k]
+        for q in range(p + 1):
+            H[p, q] = H[q, p] = _dot(row, J[q])
         H[p, p] *= 1.0 + 1e-9
-        for q in range(p):
-            H[q, p] = H[p, q]
         if not H[p, p] > 0.0:
             return False
     inverse = np.linalg.inv(H)
     x, y, gain, bias = place[0], place[1], 1.0, 0.0
     A = start.copy()
-    residuals = np.zeros(count)
+    residuals, slope = np.zeros(len(row)), np.zeros(_PARAMETERS)
     for _ in range(_ROUNDS):
         if not _residuals(b, J, A, x, y, gain, bias, residuals):
             return False
-        step = _step(J, weights, residuals, inverse)  # pyrefly: ignore[bad-argument-type]
-        M = np.linalg.inv(np.array([[1.0 + step[2], step[3]], [step[4], 1.0 + step[5]]]))
-        A = A @ M
+        for k in range(len(row)):
+            row[k] = weights[k] * residuals[k]
+        for p in range(_PARAMETERS):
+            slope[p] = _dot(row, J[p])
+        step = inverse @ slope  # pyrefly: ignore[bad-argument-type]
+        _compose_inverse(A, 1.0 + step[2], step[3], step[4], 1.0 + step[5])
         dx, dy = A[0, 0] * step[0] + A[0, 1] * step[1], A[1, 0] * step[0] + A[1, 1] * step[1]
         x, y, bias, gain = x - dx, y - dy, bias + step[6], gain + step[7]
         if not (abs(x - place[0]) < most[0] and abs(y - place[1]) < most[0]):
@@ -352,6 +352,15 @@ def _align(
 
 
 @compiled(error_model="numpy")
+def _compose_inverse(A: FloatArray, a: float, b: float, c: float, d: float) -> None:
+    """Multiply A (2, 2) by the inverse of ((a, b), (c, d)) on the right; not finite if there is none."""
+    det = a * d - b * c
+    for row in range(2):
+        p, q = A[row, 0], A[row, 1]
+        A[row, 0], A[row, 1] = (p * d - q * c) / det, (q * a - p * b) / det
+
+
+@compiled(error_model="numpy")
 def _residuals(
     b: F32, J: F32, A: FloatArray, x: float, y: float, gain: float, bias: float, out: FloatArray
 ) -> bool:
@@ -359,23 +368,22 @@ def _residuals(
     reach_x, reach_y = _HALF * (abs(A[0, 0]) + abs(A[0, 1])) + 2.0, _HALF * (abs(A[1, 0]) + abs(A[1, 1])) + 2.0
     if not (reach_x <= x < b.shape[1] - reach_x - 1.0 and reach_y <= y < b.shape[0] - reach_y - 1.0):
         return False
-    size = 2 * _HALF + 1
-    for k in range(len(out)):
-        u, v = k % size - _HALF, k // size - _HALF
-        level = _sample(b, x + A[0, 0] * u + A[0, 1] * v, y + A[1, 0] * u + A[1, 1] * v)
-        out[k] = level - (gain * J[k, 7] + bias)
+    k = 0
+    for v in range(-_HALF, _HALF + 1):
+        for u in range(-_HALF, _HALF + 1):
+            level = _sample(b, x + A[0, 0] * u + A[0, 1] * v, y + A[1, 0] * u + A[1, 1] * v)
+            out[k] = level - (gain * J[7, k] + bias)
+            k += 1
     return True
 
 
-@compiled(error_model="numpy")
-def _step(J: F32, weights: FloatArray, residuals: FloatArray, inverse: FloatArray) -> FloatArray:
-    """Least squares change (8,) of the parameters."""
-    g = np.zeros(_PARAMETERS)
-    for k in range(len(residuals)):
-        r = weights[k] * residuals[k]
-        for p in range(_PARAMETERS):
-            g[p] += r * J[k, p]
-    return inverse @ g
+@compiled(error_model="numpy", fastmath={"reassoc", "contract"})
+def _dot(a: FloatArray, b: F32) -> float:
+    """Scalar product, with terms added in any order, so that vector instructions can be used."""
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
 
 
 T = TypeVar("T")
