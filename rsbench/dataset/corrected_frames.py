@@ -168,7 +168,7 @@ def write_frame(folder: Path, name: str, fused: Fused, *, whole: bool = True, or
     if not whole:
         return
     depth = np.where(np.isfinite(fused.depth), fused.depth, np.float32(0.0))
-    write_depth(folder / "depth" / f"{name}.exr", depth)
+    write_depth(folder / "depth" / f"{name}.exr", depth, quick=True)
 
 
 def read_corrected(folder: Path, name: str) -> NDArray[Any]:
