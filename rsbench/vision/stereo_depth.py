@@ -149,8 +149,7 @@ def _fit_planes(disparity: F32, weight: F32, pull: F32, first_row: int, end_row:
                     line[4],
                 )
             _add_line(float(row - y), line, window)
-        for x in range(width):
-            fitted[y, x] = centre[x] + _plane_at_centre(window[:, x])
+        _add_planes(centre, window, fitted[y])
 
 
 @compiled(error_model="numpy", inline="always")
@@ -204,25 +203,17 @@ def _add_line(v: float, line: F32, window: FloatArray) -> None:
 
 
 @compiled(error_model="numpy")
-def _plane_at_centre(sums: FloatArray) -> float:
-    """The plane's value at the window's centre, relative to the disparity there."""
-    w0, wu, wuu, r0, ru, wv, wuv, wvv, rv = (
-        sums[0],
-        sums[1],
-        sums[2],
-        sums[3],
-        sums[4],
-        sums[5],
-        sums[6],
-        sums[7],
-        sums[8],
-    )
-    # Moments about the weighted centre, regularised for windows of one pixel's width, which have no slope across.
-    uu, uv, vv = wuu - wu * wu / w0 + 0.1 * w0, wuv - wu * wv / w0, wvv - wv * wv / w0 + 0.1 * w0
-    su, sv = ru - wu * r0 / w0, rv - wv * r0 / w0
-    determinant = uu * vv - uv * uv
-    slope_u, slope_v = (su * vv - sv * uv) / determinant, (sv * uu - su * uv) / determinant
-    return (r0 - slope_u * wu - slope_v * wv) / w0
+def _add_planes(centre: F32, window: FloatArray, fitted: F32) -> None:
+    """Fill the values of the planes at the windows' centres, ``centre`` being the disparities there."""
+    for x in range(len(centre)):
+        w0, wu, wuu, r0, ru = window[0, x], window[1, x], window[2, x], window[3, x], window[4, x]
+        wv, wuv, wvv, rv = window[5, x], window[6, x], window[7, x], window[8, x]
+        # Moments about the weighted centre, regularised for windows one pixel wide, which have no slope across.
+        uu, uv, vv = wuu - wu * wu / w0 + 0.1 * w0, wuv - wu * wv / w0, wvv - wv * wv / w0 + 0.1 * w0
+        su, sv = ru - wu * r0 / w0, rv - wv * r0 / w0
+        determinant = uu * vv - uv * uv
+        slope_u, slope_v = (su * vv - sv * uv) / determinant, (sv * uu - su * uv) / determinant
+        fitted[x] = centre[x] + (r0 - slope_u * wu - slope_v * wv) / w0
 
 
 U8 = NDArray[np.uint8]
