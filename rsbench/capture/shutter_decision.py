@@ -248,12 +248,15 @@ def scans_by_laws(
     options: RobustOptions,
     seed: int,
     start: Motion | None = None,
+    only_opposite: bool = False,
 ) -> Scans | None:
     """The scans of a given shutter or the opposite ones, whichever are certain by motion models; None: neither is.
 
     The estimated ratio must be near the given one: if no model holds, it may be arbitrary. For most frames some of
     the matches suffice to confirm the given scans under the model of ``start``; otherwise all models and then all
     matches are used. ``start`` is as in ``examine``.
+
+    With ``only_opposite``, the search ends as soon as the opposite scans are not the likeliest.
     """
     few, found = thinned([matches], _FEW)[0], None
     alone = (start.name,) if start is not None and start.name in models else models
@@ -265,7 +268,7 @@ def scans_by_laws(
         best = conclude([window], under_laws=True).likeliest
         certain = best is not None and best.probability > _CLEARLY and best.sigma <= _NEAR
         found = best.scans if best and certain and abs(best.ratio - (given.ratio or 0.0)) <= _NEAR else None
-        if found == scans_of(shutter):
+        if found == scans_of(shutter) or (only_opposite and best and best.scans != reversed_scans(given.scans[0])):
             break
     return found
 

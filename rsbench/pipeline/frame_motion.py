@@ -382,5 +382,5 @@ def _runs_backwards(
         if log_odds_of_opposite(matches, rig, shutter, other, found.motion, options.seed) <= _CERTAIN_LOG_ODDS:
             return False
     models, start = compared_models(options.motion_model), None if shakes else found.motion
-    scans = scans_by_laws(matches, rig, shutter, models, options.robust, options.seed, start)
+    scans = scans_by_laws(matches, rig, shutter, models, options.robust, options.seed, start, not shakes)
     return scans != scans_of(shutter) if shakes else scans == opposite
