@@ -162,7 +162,7 @@ def correct_four(
     clock("depth")
     given = replace(given, matches=known.matches, motion=motion, pairs=pairs)
     frames, *at_rows = correct_known_rows(
-        images, given, rig, shutter, options, views, offset, (options.target_row, *rows)
+        images, given, rig, shutter, options, views, offset, (options.target_row, *rows), check=found is not None
     )
     clock("correction")
     return CorrectedFrames(
@@ -266,7 +266,7 @@ def correct_frames(
 ) -> dict[View, Fused]:
     """``correct_known_rows`` for one row and for correctors that need nothing but a motion and depth."""
     given = Given(motion=motion, pairs=pairs)
-    return correct_known_rows(images, given, rig, shutter, options, views, disparity_offset)[0]
+    return correct_known_rows(images, given, rig, shutter, options, views, disparity_offset, check=False)[0]
 
 
 def correct_known_rows(
@@ -278,6 +278,7 @@ def correct_known_rows(
     views: tuple[View, ...],
     disparity_offset: float,
     rows: Sequence[float] | None = None,
+    check: bool = True,
 ) -> list[dict[View, Fused]]:
     """Correct the given views to the times of target rows, as images of the same cameras and lenses.
 
@@ -285,6 +286,8 @@ def correct_known_rows(
 
     Args:
         rows: target rows; by default the one in the options.
+        check: whether frames that an estimated motion does not explain are corrected by each camera alone. A given
+            motion is used as it is: a comparison of motions must not mend the worst of them.
 
     Raises:
         RsbenchError: the corrector needs a gyroscope's samples and there are none, or the corrector of another
@@ -313,9 +316,11 @@ def correct_known_rows(
         one_time=options.one_time,
     )
     found = find_corrected_rows(options.corrector, problem, views, rows)
-    found = [
-        _credible(each, replace(problem, target_row=row), options) for each, row in zip(found, rows, strict=True)
-    ]
+    if check:
+        found = [
+            _credible(each, replace(problem, target_row=row), options)
+            for each, row in zip(found, rows, strict=True)
+        ]
     return [{view: inpainted(fused, options) for view, fused in corrected.items()} for corrected in found]
 
 
