@@ -333,7 +333,7 @@ def _align(
             row[k] = weights[k] * residuals[k]
         for p in range(_PARAMETERS):
             slope[p] = _dot(row, J[p])
-        step = inverse @ slope  # pyrefly: ignore[bad-argument-type]
+        step = inverse @ slope
         _compose_inverse(A, 1.0 + step[2], step[3], step[4], 1.0 + step[5])
         dx, dy = A[0, 0] * step[0] + A[0, 1] * step[1], A[1, 0] * step[0] + A[1, 1] * step[1]
         x, y, bias, gain = x - dx, y - dy, bias + step[6], gain + step[7]

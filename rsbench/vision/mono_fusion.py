@@ -368,7 +368,8 @@ def _place(
     share = ahead / passed if abs(passed) > 1e-3 else 0.0
     u, v, s = x + share * flow[y, x, 0], y + share * flow[y, x, 1], float(rho[y, x])
     if maps is not None:
-        of_flow, moved = float(weight[y, x]), move_by(line, maps, x, y, rho[y, x])
+        of_flow = float(weight[y, x])
+        moved = move_by(line, maps, x, y, rho[y, x])  # pyrefly: ignore[bad-argument-type]
         u = of_flow * u + (1.0 - of_flow) * moved[0]
         v = of_flow * v + (1.0 - of_flow) * moved[1]
         s = of_flow * s + (1.0 - of_flow) * moved[2]
