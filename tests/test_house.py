@@ -334,7 +334,7 @@ def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
 
 
 OLDER = {
-    *("correction", "footage", "handheld", "held-out", "recorded"),
+    *("footage", "handheld", "held-out", "recorded"),
     *("trajectory", "tuning"),
 }
 """Folders of results with files that code before 1.1 made; empty when 1.1 is released."""
