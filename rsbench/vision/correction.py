@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
+from rsbench.components.motion_kernels import Vector
 from rsbench.core.camera import PinholeCamera
 from rsbench.core.geometry import MovingRig
 from rsbench.core.projection import row_poses
@@ -86,7 +87,6 @@ def connect(rho: F32, limit: F64) -> U8:
     return joined
 
 
-Vector = tuple[float, float, float]
 LineMap = tuple[Vector, Vector, Vector, Vector]
 """The rows of M of one line, and its b."""
 

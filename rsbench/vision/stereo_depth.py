@@ -149,7 +149,7 @@ def _fit_planes(disparity: F32, weight: F32, pull: F32, first_row: int, end_row:
                     line[4],
                 )
             _add_line(float(row - y), line, window)
-        _add_planes(centre, window, fitted[y])
+        _fill_centres(centre, window, fitted[y])
 
 
 @compiled(error_model="numpy", inline="always")
@@ -203,7 +203,7 @@ def _add_line(v: float, line: F32, window: FloatArray) -> None:
 
 
 @compiled(error_model="numpy")
-def _add_planes(centre: F32, window: FloatArray, fitted: F32) -> None:
+def _fill_centres(centre: F32, window: FloatArray, fitted: F32) -> None:
     """Fill the values of the planes at the windows' centres, ``centre`` being the disparities there."""
     for x in range(len(centre)):
         w0, wu, wuu, r0, ru = window[0, x], window[1, x], window[2, x], window[3, x], window[4, x]
