@@ -305,6 +305,17 @@ def test_disparities_below_their_noise_state_no_deviation() -> None:
         assert ("smaller than their noise" in found.reason) == refused
 
 
+@pytest.mark.parametrize("one_camera", [False, True])
+@pytest.mark.parametrize(("noise", "refused"), [(3.0, True), (0.5, False)])
+def test_pairs_that_the_motion_hardly_fits_state_no_deviation(one_camera: bool, noise: float, refused: bool) -> None:
+    """Features are located to less than 1.5 px; larger residuals mean another motion or wrong matches."""
+    motion = make_motion("linear", W, D)
+    matches = matches_of(motion, pairs=120, tracks=0, noise_px=noise)
+    found = RefinedSolver(one_camera=one_camera).estimate(matches, RIG, SHUTTER)
+    assert found.success and (found.covariance is None) == refused
+    assert ("the motion fits matches only to" in found.reason) == refused
+
+
 def test_negative_disparities_determine_no_direction() -> None:
     """Points beyond infinity and the opposite motion would explain them as well."""
     motion = LinearMotion(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.3]))
