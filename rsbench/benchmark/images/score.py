@@ -212,21 +212,17 @@ class Scorer:
             stored = load_disparities(file, self.sequence.rig)
         else:
             self._fail("matcher", record["matcher"], record["reason"])
-        for view in VIEWS:
-            disparity = None if stored is None else stored[f"{view[0]}_{view[1]}"]
-            yield from self._depth_rows(record, view, disparity)
-
-    def _depth_rows(self, record: Row, view: View, disparity: NDArray[np.float32] | None) -> Iterator[Row]:
-        side, frame = view
-        rig, truth = self.sequence.rig, self.sequence.depth("rs", side, frame)
-        other: Side = "right" if side == "left" else "left"
-        seen = seen_by_other(truth, self.sequence.depth("rs", other, frame), rig, side)
-        depth = None if disparity is None else depth_of(disparity, self.sequence, *view, timed=record["timed"])
-        for name, part in (("all", np.ones_like(seen)), ("visible", seen), ("occluded", ~seen)):
-            case = None if depth is None else DepthCase(depth=depth, truth=truth, pixels=part, rig=rig)
-            keys: Row = {"matcher": record["matcher"], "side": side, "frame": frame, "pixels": name}
-            keys["success"] = case is not None
-            yield keys | self._metrics(case, DepthCase)
+        for side, frame in VIEWS:
+            rig, truth = self.sequence.rig, self.sequence.depth("rs", side, frame)
+            other: Side = "right" if side == "left" else "left"
+            seen = seen_by_other(truth, self.sequence.depth("rs", other, frame), rig, side)
+            depth = None
+            if stored is not None:
+                depth = depth_of(stored[f"{side}_{frame}"], self.sequence, side, frame, timed=record["timed"])
+            for name, part in (("all", np.ones_like(seen)), ("visible", seen), ("occluded", ~seen)):
+                case = None if depth is None else DepthCase(depth=depth, truth=truth, pixels=part, rig=rig)
+                keys: Row = {"matcher": record["matcher"], "side": side, "frame": frame, "pixels": name}
+                yield keys | {"success": case is not None} | self._metrics(case, DepthCase)
 
     def _score_correction(self) -> None:
         recipes = list(stored_corrections(self.places))

@@ -230,7 +230,7 @@ def read_entry(folder: Path) -> Scored:
         scores=_read_scores(folder, record.header.protocol),
         files=record.files,
         doubt="" if record.accepted else record.doubt,
-        handed_in=record.made.get("command") not in (RUN, ORACLES),
+        handed_in=record.made.get("command") not in OWN,
     )
 
 

@@ -175,17 +175,13 @@ class CorrectionTrack(PictureTrack):
 
     def scores_of(self, true: Sequence[TrueFrame], drawn: Sequence[Frame] | None) -> Numbers:
         """Return means over the requested frames, for PSNR those of the values in dB."""
-        scores, images = list[Numbers](), list[NDArray[np.uint8] | None]()
-        for number, one in enumerate(true):
-            image, mask = (None, None) if drawn is None else drawn[number]
-            failed = image is None or mask is None
-            scores.append(_WORST_FRAME if failed else _frame(image, mask, one, self.flips))
-            images.append(image)
+        frames = list(zip(true, [None] * len(true) if drawn is None else drawn, strict=True))
+        scores = [_WORST_FRAME if frame is None else _frame(*frame, one, self.flips) for one, frame in frames]
         keys = [key for key in _WORST_FRAME if self.flips or not key.startswith("flip_")]
         found = {key: float(np.mean([each[key] for each in scores])) for key in keys}
         by_row = {f"psnr_{name}": math.nan for name in self.rows}
         by_row |= {f"psnr_{one.name}": each["psnr"] for one, each in zip(true, scores, strict=True)}
-        parted = zip(images, (one.picture.image for one in true), (one.parts for one in true), strict=True)
+        parted = ((None if frame is None else frame[0], one.picture.image, one.parts) for one, frame in frames)
         squares = rms_by_part(self.part_score, parted)
         return {**found, **by_row, **squares, "error": 1.0 - found["ssim"]}
 

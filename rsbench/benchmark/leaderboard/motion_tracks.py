@@ -283,9 +283,15 @@ class MotionTrack(SolverTrack):
         return {"w": [0.01, -0.02, 0.005], "d": [0.1, 0.0, 0.2], "metric": False, "reference_point": "left"}
 
     def notes(self, answers: Sequence[Answer], split: Split) -> Iterator[str]:
-        if mistaken := _mistaken(answers, split):
-            words, count = mistaken
-            yield f"{count} of {len(answers)} motions are near to another reading of the truth: {words}"
+        found = Counter[str | None]()
+        for answer in answers:
+            truth = split.by_name[answer.name]
+            given = *_vectors(answer), truth.motion.w, truth.motion.d
+            found[misreading(*given, truth.rig, answer.reference_point)] += 1
+        del found[None]  # right, or wrong in no common manner
+        for words, count in found.most_common(1):
+            if 2 * count > len(answers):
+                yield f"{count} of {len(answers)} motions are near to another reading of the truth: {words}"
 
     def answer(self, problem: Problem, entry: SolverEntry, runner: SolverRunner) -> dict[str, Any]:
         seed, model = seed_of_answer(problem, entry), AUTO if entry.name == CHOOSES else None
@@ -317,19 +323,6 @@ class MotionTrack(SolverTrack):
         pairs = "both" if {"left", "right"} <= set(uses) else "left"
         seen = "links" if "links" in uses else pairs
         return bound_medians(split.draws, split.seed, len(split.truths), seen)
-
-
-def _mistaken(answers: Sequence[Answer], split: Split) -> tuple[str, int] | None:
-    """Return the mistake that explains most of the motions, and their number; None if there is none."""
-    found: Counter[str] = Counter()
-    for answer in answers:
-        truth = split.by_name[answer.name]
-        given = *_vectors(answer), truth.motion.w, truth.motion.d
-        words = misreading(*given, truth.rig, answer.reference_point)
-        if words:
-            found[words] += 1
-    words, count = found.most_common(1)[0] if found else ("", 0)
-    return (words, count) if 2 * count > len(answers) else None
 
 
 def motion_row(truth: Truth, answer: Answer | None) -> Row:

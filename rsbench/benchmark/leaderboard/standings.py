@@ -20,7 +20,7 @@ from scipy.special import stdtr
 
 from rsbench.benchmark.leaderboard.board import Scored
 from rsbench.benchmark.leaderboard.deviations import Calibration, calibration, named_numbers
-from rsbench.benchmark.leaderboard.track import KNOWLEDGE, ORACLE, Track
+from rsbench.benchmark.leaderboard.track import KNOWLEDGE, ORACLE, Score, Track
 from rsbench.benchmark.leaderboard.tracks import track_of_id
 from rsbench.benchmark.statistics import COVERAGE, format_interval, scene_means, score_interval, with_ends
 from rsbench.core.errors import RsbenchError
@@ -203,7 +203,7 @@ def standings(entries: Sequence[Scored], at_most: Collection[str] | None = None)
     scenes, primary = list(problems["scene"]), track_of_id(kept[0].header.protocol).primary
     places = _ranked(ranked, primary.key, primary.sign, scenes)
     log_places = _ranked(stating, "log_score", 1.0, scenes)
-    lines = [_standing(each, scenes, places.get(each, Place()), log_places.get(each, Place())) for each in kept]
+    lines = [_standing(each, places.get(each, Place()), log_places.get(each, Place())) for each in kept]
     return sorted(lines, key=_order)
 
 
@@ -228,44 +228,34 @@ def _order(standing: Standing) -> tuple[bool, int, str, float, str]:
     return standing.rank is None, len(set(header.uses)), standing.uses, -score, header.method
 
 
-def _standing(scored: Scored, scenes: Sequence[str], place: Place, log_place: Place) -> Standing:
+def _standing(scored: Scored, place: Place, log_place: Place) -> Standing:
     scores, track = scored.scores, track_of_id(scored.header.protocol)
+    parts = [(str(name), part) for name, part in scores.groupby(track.parting)] if track.parting else []
     return Standing(
         scored=scored,
         rank=place.rank,
         peers=place.peers,
         ties=place.ties,
-        means={
-            score.key: score_interval(scores[score.key].to_numpy(), scenes, score.kind == "share")
-            for score in track.scores
-            if score.kind != "median"
-        },
+        means={score.key: _mean(scores, score) for score in track.scores if score.kind != "median"},
         medians={name: _median(scores[name].to_numpy()) for name in track.of_kind("median")},
         calibration=calibration(scores, track.unknowns),
         log_rank=log_place.rank,
         log_peers=log_place.peers,
-        parts={} if not track.parting else _parts(scores, track),
-        worst=_worst(scores, track),
+        parts={name: _mean(part, track.primary) for name, part in parts},
+        worst={name: _worst(part, track.error) for name, part in (parts if track.parting else [("all", scores)])},
     )
 
 
-def _worst(scores: pd.DataFrame, track: Track) -> dict[str, tuple[str, float]]:
-    parts = scores.groupby(track.parting) if track.parting else [("all", scores)]
-    found: dict[str, tuple[str, float]] = {}
-    for name, part in parts:
-        errors = part[track.error].to_numpy(dtype=np.float64)
-        at = int(np.argmax(np.where(np.isnan(errors), -np.inf, errors)))
-        found[str(name)] = str(part["problem"].iloc[at]), float(errors[at])
-    return found
+def _mean(scores: pd.DataFrame, score: Score) -> tuple[float, float, float]:
+    """Return the mean of a score over scenes and the ends of its confidence interval."""
+    return score_interval(scores[score.key].to_numpy(), list(scores["scene"]), score.kind == "share")
 
 
-def _parts(scores: pd.DataFrame, track: Track) -> dict[str, tuple[float, float, float]]:
-    return {
-        str(name): score_interval(
-            part[track.primary.key].to_numpy(), list(part["scene"]), track.primary.kind == "share"
-        )
-        for name, part in scores.groupby(track.parting)
-    }
+def _worst(scores: pd.DataFrame, column: str) -> tuple[str, float]:
+    """Return the problem with the largest error, and that error; NaN is the smallest."""
+    errors = scores[column].to_numpy(dtype=np.float64)
+    at = int(np.argmax(np.where(np.isnan(errors), -np.inf, errors)))
+    return str(scores["problem"].iloc[at]), float(errors[at])
 
 
 def _median(values: FloatArray) -> float:
