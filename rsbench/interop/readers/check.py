@@ -108,9 +108,8 @@ def _agreement(recording: Recording, side: Side, first: int, second: int) -> Agr
     camera, shutter = recording.cameras[side], recording.shutters[side]
     pose_at = recording.poses[side]
     depth, other = recording.depths[side, first](), recording.depths[side, second]()
-    x, y = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
     seen = depth > 0.0
-    pixels = np.stack([x[seen], y[seen]], axis=-1)
+    pixels = camera.pixel_grid()[seen]
     in_camera = depth[seen][:, None] * camera.unproject(pixels)
     world = transform(inverse(pose_at(shutter.pixel_time(pixels, first, side))), in_camera)
     landed, points = pixels, world

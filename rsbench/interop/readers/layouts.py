@@ -549,10 +549,7 @@ def _read_carla_depth(path: Path, camera: PinholeCamera, radial: bool) -> FloatA
     if len(rows) != camera.height:
         raise RsbenchError(f"{path}: has {len(rows)} rows, not {camera.height}")
     distance = np.array(rows)
-    if not radial:
-        return distance
-    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    return distance / np.linalg.norm(camera.unproject(np.stack([x, y], axis=-1)), axis=-1)
+    return distance / np.linalg.norm(camera.unproject(camera.pixel_grid()), axis=-1) if radial else distance
 
 
 def read_fastec(folder: Path) -> list[Recording]:
