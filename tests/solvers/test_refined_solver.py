@@ -307,7 +307,9 @@ def test_disparities_below_their_noise_state_no_deviation() -> None:
 
 @pytest.mark.parametrize("one_camera", [False, True])
 @pytest.mark.parametrize(("noise", "refused"), [(3.0, True), (0.5, False)])
-def test_pairs_that_the_motion_hardly_fits_state_no_deviation(one_camera: bool, noise: float, refused: bool) -> None:
+def test_pairs_that_the_motion_hardly_fits_state_no_deviation(
+    one_camera: bool, noise: float, refused: bool
+) -> None:
     """Features are located to less than 1.5 px; larger residuals mean another motion or wrong matches."""
     motion = make_motion("linear", W, D)
     matches = matches_of(motion, pairs=120, tracks=0, noise_px=noise)
