@@ -80,7 +80,8 @@ _ANNOUNCED = {
     ),
 }
 """Announced fingerprints of the splits of points and recordings, public and held-out, and of the motions of the
-datasets ``laws`` and ``handheld``. The key is a hash of the truth rounded to nine digits, which is the same on all processors."""
+datasets ``laws`` and ``handheld``. The key is a hash of the truth rounded to nine digits, which is the same on all
+processors."""
 Kind = Literal["share", "mean", "median"]
 Row = dict[str, Any]
 Numbers = dict[str, float]
