@@ -31,7 +31,6 @@ from rsbench.core.rig import SIDES, VIEWS, StereoRig, View
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.feature_matcher import FeatureMatcher, of_sensors, undistorted
 from rsbench.vision.features import (
-    BLUR_PX,
     ROW_TOLERANCE_PX,
     Aligned,
     Recent,
@@ -40,6 +39,7 @@ from rsbench.vision.features import (
     content_key,
     forget_features,
     refine_matches,
+    smooth_spline,
     still,
 )
 from rsbench.vision.flow import dense_flow
@@ -287,7 +287,7 @@ def _of_level(grey: Mapping[View, U8], flows: _Flows, level: int, options: Dense
     first = _resized(source, scale)
     (l1, moved), (r0, beside_0) = followed(first, 0), followed(first, 1)
     r1, beside_1 = followed(l1, 2)
-    smooth = {view: np.asarray(cv2.GaussianBlur(image, (0, 0), BLUR_PX)) for view, image in small.items()}
+    smooth = {view: smooth_spline(image) for view, image in small.items()}
     left, places = np.flatnonzero(moved & beside_0 & beside_1), {view: source.copy() for view in VIEWS}
     covariance = np.zeros((len(source), 3))
     for view, ends in ((("right", 0), r0), (("left", 1), l1), (("right", 1), r1)):

@@ -37,7 +37,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, track_pairs
 from rsbench.core.rig import SIDES, AlignedCamera, Side, StereoRig, View
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.feature_matcher import FeatureMatcher
-from rsbench.vision.images import at_full_size, grey_u8, halved, keys_weights, map_frames
+from rsbench.vision.images import at_full_size, grey_u8, halved, map_frames, spline_weights
 
 _CHUNK = 256
 F32 = NDArray[np.float32]
@@ -129,9 +129,8 @@ def _scan(
                 back_nearest[j], back[j] = distance, i
 
 
-BLUR_PX = 0.8
-"""Standard deviation of the smoothing of images, px: the cubic kernel interpolates the smoothed image without a
-bias."""
+_BLUR_PX = 0.8
+"""Standard deviation of the smoothing of images, px."""
 _HALF = 7
 """Patches are 2 _HALF + 1 px wide, with Gaussian weights."""
 _SPREAD = 0.6 * _HALF
@@ -203,8 +202,32 @@ def _not_of_tracks(matches: Correspondences, frame: int) -> FloatArray:
 
 
 def smoothed(image: NDArray[Any]) -> F32:
-    """Smoothed grey levels (H, W), from which patches are taken."""
-    return np.asarray(cv2.GaussianBlur(grey_u8(image).astype(np.float32), (0, 0), BLUR_PX))
+    """``smooth_spline`` of an image (H, W[, 3]), uint8 or uint16."""
+    return smooth_spline(grey_u8(image).astype(np.float32))
+
+
+def smooth_spline(levels: F32) -> F32:
+    """Coefficients (H, W) of the cubic B-spline through the smoothed grey levels (H, W), from which patches are
+    taken.
+
+    A kernel on the levels themselves smooths noise and aliasing most in the middle between two pixels, where
+    patches therefore seem to match better. On aliased textures, Keys' kernel pulls matches there by 0.02 px, the
+    spline by 0.003 px.
+    """
+    return np.asarray(cv2.sepFilter2D(levels, -1, _SMOOTHING, _SMOOTHING))
+
+
+def _smoothing() -> F32:
+    """Kernel of the smoothing and of the inverse of the spline's samples, (1, 4, 1) / 6.
+
+    M. Unser, Splines: a perfect fit for signal and image processing, IEEE Signal Processing Magazine 1999.
+    """
+    near, pole = np.arange(-6, 7), np.sqrt(3.0) - 2.0
+    found = np.convolve(np.exp(-0.5 * (near / _BLUR_PX) ** 2), pole ** np.abs(near))
+    return np.asarray(found / np.sum(found), dtype=np.float32)
+
+
+_SMOOTHING = _smoothing()
 
 
 class Aligned(NamedTuple):
@@ -231,7 +254,7 @@ def align(
     """Align patches at points of a with places in b nearby.
 
     Args:
-        a, b: (H, W) images from ``smoothed``.
+        a, b: (H, W) images from ``smoothed`` or ``smooth_spline``.
         points_a, points_b: (n, 2) px; a point that cannot be aligned keeps its place in b.
         start: (2, 2) approximate affine map from the pixels around a point of a to those of b; None: the identity.
         most_px: largest change of a place.
@@ -247,9 +270,9 @@ def align(
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def _sample(image: F32, x: float, y: float) -> np.float32:
-    """The interpolated image at a place whose window of 4 x 4 px lies inside it."""
+    """The smoothed image at a place; ``image`` has the coefficients, and the window of 4 x 4 px lies inside it."""
     i, j = int(x), int(y)
-    wx, wy = keys_weights(np.float32(x - i)), keys_weights(np.float32(y - j))
+    wx, wy = spline_weights(np.float32(x - i)), spline_weights(np.float32(y - j))
     total = np.float32(0.0)
     for k in range(4):
         row = image[j - 1 + k]

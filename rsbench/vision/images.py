@@ -175,6 +175,13 @@ def keys_weights(t: np.float32) -> Weights:
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
+def spline_weights(t: np.float32) -> Weights:
+    """Weights of a cubic B-spline's coefficients at -1, 0, 1, 2 for position t in [0, 1]."""
+    sixth, most, half, u = np.float32(1.0 / 6.0), np.float32(2.0 / 3.0), np.float32(0.5), np.float32(1.0) - t
+    return sixth * u * u * u, most - t * t * (u + half * t), most - u * u * (t + half * u), sixth * t * t * t
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
 def _cubic(image: F32, positions: F32, values: F32) -> None:
     height, width, channels = image.shape
     flat = image.ravel()

@@ -250,6 +250,33 @@ def test_patches_follow_affine_maps(shear: list[float], shift: list[float], gain
     assert np.max(np.abs(found - truth)[done]) < 0.12
 
 
+@pytest.mark.parametrize("eighths", [2, 6])
+def test_fractions_of_a_pixel_do_not_pull(eighths: int) -> None:
+    """Pixels are means of areas of a texture that is finer than they are, as in cameras without a low-pass filter.
+
+    With Keys' kernel, shifts of 2 and 6 eighths of a pixel are 0.02 px too large and too small in the mean, whose
+    deviation is 0.0001 px; with the spline 0.003 px.
+    """
+    rng, size = np.random.default_rng(eighths), 8 * (400 + 1)
+    texture = cv2.GaussianBlur(rng.standard_normal((size, size)).astype(np.float32), (0, 0), 5.0)
+    levels = 128.0 + 50.0 / float(np.std(texture)) * texture
+    a, b = (
+        smoothed(np.clip(np.rint(_pixels(levels[:, first:])), 0, 255).astype(np.uint8))
+        for first in (8, 8 - eighths)
+    )
+    places = np.stack(np.meshgrid(np.arange(20.0, 381.0, 15.0), np.arange(20.0, 381.0, 15.0)), axis=-1).reshape(
+        -1, 2
+    )
+    found, done, _ = align(a, b, places, places)
+    assert np.all(done)
+    assert abs(np.mean(found[:, 0] - places[:, 0]) - eighths / 8.0) < 0.005
+
+
+def _pixels(texture: np.ndarray) -> np.ndarray:
+    """Means (400, 400) over squares of 8 x 8."""
+    return texture[:3200, :3200].reshape(400, 8, 400, 8).mean(axis=(1, 3))
+
+
 def test_noise_decides_how_well() -> None:
     """At 1.5 levels of noise in each image, least squares leave 1.5 sqrt(2) over the root of the summed squares of
     the gradients, of which the smoothing and the weights keep a half: some 0.02 px here."""
