@@ -142,7 +142,7 @@ LEAST_DEPTHS = 0.7
 """Smallest ratio of the median disparity to its standard deviation for which a covariance is stated. Below it,
 errors of a point are not described by a linearisation: only half of the stated 95 % ellipsoids contained the
 truth."""
-MOST_NOISE_PX = 1.5
+_MOST_NOISE_PX = 1.5
 """Largest noise, px, at which pairs alone have a stated covariance. Features are located more precisely, so above
 it, the motion model or most matches are wrong, and without tracks neither is noticed otherwise."""
 NO_DEPTHS = "no deviation can be stated: disparities are smaller than their noise"
@@ -403,7 +403,7 @@ class RefinedSolver(Solver):
         elif stated is not None and stated.count < FEWEST_PER_PARAMETER * packed.parameters:
             covariance = None
             reasons.append(f"no deviation can be stated: {stated.count:.0f} effective matches are too few")
-        elif not linked and variance > MOST_NOISE_PX**2:
+        elif not linked and variance > _MOST_NOISE_PX**2:
             covariance = None
             reasons.append(f"no deviation can be stated: the motion fits matches only to {variance**0.5:.1f} px")
         if not direction_known:

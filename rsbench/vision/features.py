@@ -202,7 +202,7 @@ def _not_of_tracks(matches: Correspondences, frame: int) -> FloatArray:
 
 
 def smoothed(image: NDArray[Any]) -> F32:
-    """``smooth_spline`` of an image (H, W[, 3]), uint8 or uint16."""
+    """Return ``smooth_spline`` of the grey levels of an image (H, W[, 3]), uint8 or uint16."""
     return smooth_spline(grey_u8(image).astype(np.float32))
 
 
