@@ -11,7 +11,7 @@ import hashlib
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -497,6 +497,11 @@ Part: TypeAlias = Literal["whole", "left", "right"]
 class FrameSource:
     """Frames of one camera, in order, from a folder of images (by name) or a video; can be read repeatedly."""
 
+    _part: Part = "whole"
+    _files: Sequence[Path] = ()
+    _video: VideoFile | None = None
+    _kept: frozenset[int] | None = None
+
     def __init__(self, path: Path, part: Part = "whole") -> None:
         """Open a folder or video; ``part`` selects a half of frames that show two cameras side by side.
 
@@ -504,9 +509,6 @@ class FrameSource:
             RsbenchError: the path is missing, has no frames, or is not a readable video.
         """
         self.path, self._part = path, part
-        self._files: list[Path] = []
-        self._video: VideoFile | None = None
-        self._kept: frozenset[int] | None = None
         if path.is_dir():
             images = (file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
             self._files = sorted((file for file in images if not file.name.startswith(".")), key=_natural)
@@ -526,7 +528,6 @@ class FrameSource:
             raise RsbenchError("no frames")
         source = cls.__new__(cls)
         source.path, source._files, source.count = files[0].parent, files, len(files)
-        source._part, source._video, source._kept = "whole", None, None
         return source
 
     @property
@@ -596,8 +597,17 @@ class ImageSource(FrameSource):
 
     def __init__(self, images: Iterable[NDArray[Any]]) -> None:
         """Images (H, W[, 3]) in order."""
-        self.path, self._images, self._kept = Path("images"), list(images), None
+        self.path, self._images = Path("images"), list(images)
         self.count = len(self._images)
+
+    @cached_property
+    def orientation(self) -> int:
+        """1: the images are displayed as they are."""
+        return 1
+
+    def identity(self) -> list[str]:
+        """Digests of the images."""
+        return [hashlib.sha256(image.tobytes()).hexdigest() for image in self._images]
 
     @cached_property
     def timeline(self) -> Timeline:

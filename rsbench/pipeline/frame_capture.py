@@ -32,7 +32,7 @@ from rsbench.capture.self_calibration import FoundCamera, FoundFocal, find_camer
 from rsbench.capture.shutter_decision import as_global, known_of, runs_backwards, shutter_found
 from rsbench.capture.two_frame_estimate import Capture, conclude, examine
 from rsbench.core.correspondences import Correspondences, without_lens
-from rsbench.core.rig import SIDES, Side, StereoRig
+from rsbench.core.rig import SIDES, StereoRig
 from rsbench.core.shutter import RollingShutter, Scanning
 from rsbench.core.so3 import FloatArray
 from rsbench.pipeline.footage import Progress, no_progress
@@ -197,12 +197,9 @@ _FEWEST_MATCHES = 12
 def find_matches(
     images: Images,
     options: CorrectionOptions,
-    sides: tuple[Side, Side] = SIDES,
     rig: StereoRig | None = None,
 ) -> Correspondences:
-    """Correspondences of the four frames; ``sides`` names the images that are used as left and as right ones.
-
-    With a ``rig``, correspondences are in the pixels of its cameras.
+    """Correspondences of the four frames; with a ``rig``, they are in the pixels of its cameras.
 
     Raises:
         RsbenchError: another package's feature matcher failed, see ``find_correspondences``.
@@ -210,8 +207,8 @@ def find_matches(
     from rsbench.vision.feature_matcher import find_correspondences
     from rsbench.vision.images import eight_bit
 
-    levels = eight_bit([images[side, frame] for frame in (0, 1) for side in sides])
     names = [(side, frame) for frame in (0, 1) for side in SIDES]
+    levels = eight_bit([images[name] for name in names])
     return find_correspondences(options.features, dict(zip(names, levels, strict=True)), rig)
 
 

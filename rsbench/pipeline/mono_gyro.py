@@ -38,7 +38,7 @@ from rsbench.solvers.gyro_and_gravity import GyroSolver
 from rsbench.vision.mono_fusion import Flows, OwnMotion, find_flows
 
 FARTHEST_S = 0.5
-"""Largest shift that is searched for, seconds."""
+"""Largest shift of a clock that is estimated, seconds."""
 PAIRS = 24
 """Most pairs of frames from which the shift is estimated; they are evenly spaced in the video."""
 _STEP = 1.0 / 32
@@ -50,7 +50,8 @@ _FREEDOM = 4.0
 _LEAST_RATE = 2e-4
 """Least standard deviation of a pair's rate, rad per frame period: 0.1 px at a focal length of 500 px."""
 _APART = 1.0
-"""Two shifts that differ by more than this, frame periods, are different solutions."""
+"""Two shifts that differ by more than this, frame periods, are different solutions; the search extends this far
+beyond the largest shift."""
 _CERTAIN, _MOST_SIGMA, _FEWEST = 0.99, 0.15, 6
 """Least probability, largest deviation (frame periods) and fewest pairs of a shift that counts as determined."""
 _CLEARLY = 2.5
@@ -140,13 +141,14 @@ def with_clock_corrected(
 def find_clock(pairs: PairRates, samples: FloatArray, readout_ratio: float, farthest: float) -> Clock:
     """Estimate the time shift at which samples (n, 4) tau, w agree best with the rates of pairs.
 
-    Args:
-        farthest: largest shift of the search, frame periods.
+    Larger shifts than ``farthest``, frame periods, do not count as determined. Some are searched all the same, so
+    that the best shift up to there is not merely the one that is nearest to a better one beyond.
     """
     count = len(pairs.starts)
     if count < _FEWEST:
         return Clock(0.0, farthest, False, False, count)
-    shifts = _STEP * np.arange(-int(farthest / _STEP), int(farthest / _STEP) + 1)
+    steps = int((farthest + _APART) / _STEP)
+    shifts = _STEP * np.arange(-steps, steps + 1)
     differences = pairs.rates - mean_rates(samples, pairs.starts + shifts[:, None], readout_ratio)
     differences -= np.median(differences, axis=1, keepdims=True)  # the bias
     squares = np.sum(differences**2, axis=-1)
@@ -161,8 +163,7 @@ def find_clock(pairs: PairRates, samples: FloatArray, readout_ratio: float, fart
     certainty = float(np.sum(shares[near]))
     shift = float(shifts[near] @ shares[near]) / certainty
     sigma = float(np.sqrt((shifts[near] - shift) ** 2 @ shares[near] / certainty + _LEAST_SIGMA**2))
-    inside = abs(shift) < farthest - _APART
-    if certainty < _CERTAIN or sigma > _MOST_SIGMA or not inside or left > _EXPLAINED * shaken:
+    if certainty < _CERTAIN or sigma > _MOST_SIGMA or abs(shift) > farthest + sigma or left > _EXPLAINED * shaken:
         return Clock(0.0, farthest, False, False, count)
     return Clock(shift, sigma, True, abs(shift) > _CLEARLY * sigma, count)
 

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsbench.components.compiled import compiled
-from rsbench.components.motion_kernels import Vector, apply
 from rsbench.core.camera import Lens, PinholeCamera
 from rsbench.core.se3 import Pose
 from rsbench.core.so3 import FloatArray
@@ -235,31 +234,6 @@ def _seen_from(
     u = (A[0, 0] * p + A[0, 1] * q + A[0, 2] * r + rho * B[0]) * s
     v = (A[1, 0] * p + A[1, 1] * q + A[1, 2] * r + rho * B[1]) * s
     u, v = see(lens, u, v)
-    return u, v, s
-
-
-@compiled(error_model="numpy", inline="always")
-def sight_of(x: int, y: int, maps: Reprojection) -> tuple[Vector, Vector]:
-    """Ray of a pixel, and centre of the camera at the time of its line, in the world's axes."""
-    G, c, own = maps.G, maps.c, line_of(maps.columns, x, y)
-    gx, gy = look(maps.ideal, x, y)
-    return apply(G[own], (gx, gy, 1.0)), (c[own, 0], c[own, 1], c[own, 2])
-
-
-@compiled(error_model="numpy", inline="always")
-def homography(sight: tuple[Vector, Vector], line: int, maps: Reprojection) -> tuple[Vector, Vector]:
-    """M and b for a pixel and a line of the other view, which sees the point at M + rho b (homogeneous)."""
-    A, B = maps.A[line], maps.B[line]
-    centre = apply(A, sight[1])
-    return apply(A, sight[0]), (centre[0] + B[0], centre[1] + B[1], centre[2] + B[2])
-
-
-@compiled(error_model="numpy", inline="always")
-def land(M: Vector, b: Vector, rho: float, lens: Table) -> tuple[float, float, float]:
-    """Project by M and b of ``homography``: as ``reproject`` returns it; NaN behind the camera."""
-    z = M[2] + rho * b[2]
-    s = 1.0 / z if z > 0.0 else np.nan
-    u, v = see(lens, (M[0] + rho * b[0]) * s, (M[1] + rho * b[1]) * s)
     return u, v, s
 
 

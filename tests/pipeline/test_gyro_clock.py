@@ -1,4 +1,4 @@
-"""The clock of a gyroscope beside frames of one camera. Truth: a shake in closed form, and its rotations."""
+"""The offset of a gyroscope's clock, estimated with frames of one camera. Truth: a shake in closed form."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ ROWS = np.linspace(0.0, RATIO, 33)
 
 
 def _shake(tau: Array, size: float = 1.0) -> Array:
-    """Rotation vectors (..., 3): a walk's, of some tenths of a degree, on a steady turn."""
+    """Rotation vectors (..., 3) of a walking person: some tenths of a degree, on a constant angular velocity."""
     waves = [(0.11, 0.0, 0.3), (0.23, 1.0, 0.2), (0.37, 2.0, 0.1)]
     axes = [sum(a * np.sin(2.0 * np.pi * f * tau + p + k) for f, p, a in waves) for k in (0.0, 2.0, 4.0)]
     return np.deg2rad(size * np.stack(axes, axis=-1) + 0.3 * tau[..., None])
 
 
 def _pairs(size: float = 1.0, noise: float = 3e-4) -> PairRates:
-    """Of each row's own rotation over a period, the mean over the rows."""
+    """The mean over the rows of each row's rotation over a period."""
     starts = np.arange(20.0)
     moments = starts[:, None] + ROWS
     before, after = so3.exp(_shake(moments, size)), so3.exp(_shake(moments + 1.0, size))
@@ -31,14 +31,14 @@ def _pairs(size: float = 1.0, noise: float = 3e-4) -> PairRates:
 
 
 def _samples(late: float, size: float = 1.0) -> Array:
-    """Of a gyroscope with a bias of 0.03 rad/s at 30 Hz, whose times are that late."""
+    """Samples of a gyroscope with a bias of 0.03 rad/s at 30 Hz, whose times are too large by ``late``."""
     tau, step = np.arange(-20.0, 45.0, 1.0 / 16.0), 1e-4
     turns = so3.exp(_shake(tau + step, size)) @ np.swapaxes(so3.exp(_shake(tau - step, size)), -1, -2)
     return np.column_stack([tau + late, so3.log(turns) / (2.0 * step) + [1e-3, -5e-4, 2e-4]])
 
 
 @pytest.mark.parametrize("late", [-11.3, -0.4, 0.0, 6.25])
-def test_a_shake_tells_how_late_the_clock_is(late: float) -> None:
+def test_a_shake_determines_the_offset_of_the_clock(late: float) -> None:
     clock = find_clock(_pairs(), _samples(late), RATIO, FARTHEST)
     assert clock.told and clock.used == (late != 0.0)
     assert abs(clock.shift - late) < 3.0 * clock.sigma and clock.sigma < 0.1
@@ -51,7 +51,7 @@ def test_pairs_whose_motion_is_wrong_count_little() -> None:
     assert clock.told and abs(clock.shift - 6.25) < 3.0 * clock.sigma
 
 
-def test_a_steady_turn_few_pairs_and_another_gyroscope_tell_nothing() -> None:
+def test_a_constant_rate_few_pairs_and_another_gyroscope_determine_no_offset() -> None:
     still = find_clock(_pairs(0.0), _samples(3.0, 0.0), RATIO, FARTHEST)
     few = find_clock(PairRates(*(each[:5] for each in _pairs())), _samples(3.0), RATIO, FARTHEST)
     other = find_clock(_pairs(), _samples(3.0) * [1.0, -1.0, -1.0, -1.0], RATIO, FARTHEST)
@@ -59,8 +59,16 @@ def test_a_steady_turn_few_pairs_and_another_gyroscope_tell_nothing() -> None:
         assert not clock.told and not clock.used and clock.shift == 0.0
 
 
-def test_a_shift_beyond_what_is_looked_for_is_not_told() -> None:
-    assert not find_clock(_pairs(), _samples(6.25), RATIO, 4.0).told
+@pytest.mark.parametrize("late, farthest", [(0.4, 0.5), (-0.8, 1.0), (3.8, 4.0)])
+def test_offsets_up_to_the_largest_one_are_found(late: float, farthest: float) -> None:
+    clock = find_clock(_pairs(), _samples(late), RATIO, farthest)
+    assert clock.told and clock.used
+    assert abs(clock.shift - late) < 3.0 * clock.sigma
+
+
+@pytest.mark.parametrize("late, farthest", [(6.25, 4.0), (-1.4, 0.5), (0.8, 0.5)])
+def test_an_offset_beyond_the_largest_one_is_not_determined(late: float, farthest: float) -> None:
+    assert not find_clock(_pairs(), _samples(late), RATIO, farthest).told
 
 
 @pytest.mark.parametrize("start", [0.0, 3.0])

@@ -128,7 +128,7 @@ def _best(pictures: TruePictures, place: Path) -> None:
         options = CorrectionOptions(target_row=each.row)
         inputs = KnownInputs.of(sequence.shutter)
         fused = correct_four(images, sequence.rig, inputs, options, given=given, views=(VIEW,)).frames[VIEW]
-        write_bytes(place / f"{each.stem}.png", frame_png(fused.image, fused.origin != 0))
+        write_bytes(place / f"{each.stem}.png", frame_png(fused.image, fused.origin != Origin.NOBODY))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -211,7 +211,7 @@ class DrawnPoints(Inputs):
     def split(self, track: Track, data: Path | None, seed_file: Path | None, secret: bool) -> Split:
         draws, seed = self.draws_of(data), seed_of(seed_file)
         if secret and seed_file is None:
-            raise RsbenchError("--secret: of the track 'points' a --seed-file makes a secret split; leave it out")
+            raise RsbenchError(f"--secret: a --seed-file makes the split of {track.name} secret; leave it out")
         label = "dev" if data is None else _checked_name(data.resolve().name, data)
         label = label if seed_file is None else "test"
         truths = tuple(_truth(draws, seed, number) for number in range(draws.problems))
