@@ -37,7 +37,7 @@ from rsbench.core.correspondences import BoolArray, Correspondences, track_pairs
 from rsbench.core.rig import SIDES, AlignedCamera, Side, StereoRig, View
 from rsbench.core.so3 import FloatArray
 from rsbench.vision.feature_matcher import FeatureMatcher
-from rsbench.vision.images import at_full_size, grey_u8, halved, map_frames, spline_weights
+from rsbench.vision.images import SPLINE_INVERSE, at_full_size, grey_u8, halved, map_frames, spline_weights
 
 _CHUNK = 256
 F32 = NDArray[np.float32]
@@ -218,12 +218,8 @@ def smooth_spline(levels: F32) -> F32:
 
 
 def _smoothing() -> F32:
-    """Kernel of the smoothing and of the inverse of the spline's samples, (1, 4, 1) / 6.
-
-    M. Unser, Splines: a perfect fit for signal and image processing, IEEE Signal Processing Magazine 1999.
-    """
-    near, pole = np.arange(-6, 7), np.sqrt(3.0) - 2.0
-    found = np.convolve(np.exp(-0.5 * (near / _BLUR_PX) ** 2), pole ** np.abs(near))
+    """Kernel of the smoothing and of ``SPLINE_INVERSE``."""
+    found = np.convolve(np.exp(-0.5 * (np.arange(-6, 7) / _BLUR_PX) ** 2), SPLINE_INVERSE)
     return np.asarray(found / np.sum(found), dtype=np.float32)
 
 

@@ -174,6 +174,12 @@ def keys_weights(t: np.float32) -> Weights:
     )
 
 
+SPLINE_INVERSE = (np.sqrt(3.0) - 2.0) ** np.abs(np.arange(-6, 7))
+"""(13,) filter that turns samples into a cubic B-spline's coefficients, up to its sum.
+
+M. Unser, Splines: a perfect fit for signal and image processing, IEEE Signal Processing Magazine 1999."""
+
+
 @compiled(error_model="numpy", fastmath={"contract"})
 def spline_weights(t: np.float32) -> Weights:
     """Weights of a cubic B-spline's coefficients at -1, 0, 1, 2 for position t in [0, 1]."""

@@ -37,7 +37,7 @@ from rsbench.core.motion import Motion
 from rsbench.core.rig import SIDES, Side, StereoRig
 from rsbench.core.shutter import RollingShutter
 from rsbench.core.so3 import FloatArray
-from rsbench.vision.images import grey_u8, guided_upsample, halved, keys_weights, resample
+from rsbench.vision.images import SPLINE_INVERSE, grey_u8, guided_upsample, halved, resample, spline_weights
 from rsbench.vision.stereo_matcher import (
     F32,
     MatcherEntry,
@@ -65,17 +65,28 @@ _BAND = 32  # rows of one piece of work
 def refine_disparity(
     reference: NDArray[np.uint8], other: NDArray[np.uint8], disparity: F32, *, iterations: int = 2
 ) -> F32:
-    """Refined disparity (H, W), px; NaN stays NaN. Grey images (H, W), ``reference`` as the left one."""
-    a, b = reference.astype(np.float32), other.astype(np.float32)
+    """Refined disparity (H, W), px; NaN stays NaN. Grey images (H, W), ``reference`` as the left one.
+
+    Rows are interpolated by cubic B-splines: Keys' kernel smooths most in the middle between two pixels, where
+    aliased images therefore seem to match better, and shifts disparities there by up to 0.015 px.
+    """
+    levels = reference.astype(np.float32)
+    a, b = _along_rows(levels), _along_rows(other.astype(np.float32))
     start = np.ascontiguousarray(disparity, dtype=np.float32)
     current = start
     for _ in range(iterations):
         weight, pull, fitted = (np.zeros_like(start) for _ in range(3))
-        _in_bands(len(a), lambda y0, y1: _measure(a, b, current, y0, y1, weight, pull))  # noqa: B023
+        _in_bands(len(a), lambda y0, y1: _measure(levels, a, b, current, y0, y1, weight, pull))  # noqa: B023
         padded = _padded(current, np.nan), _padded(weight, 0.0), _padded(pull, 0.0)
         _in_bands(len(a), lambda y0, y1: _fit_planes(*padded, y0, y1, fitted))  # noqa: B023
         current = np.clip(fitted, start - np.float32(_FARTHEST), start + np.float32(_FARTHEST))
     return current
+
+
+def _along_rows(levels: F32) -> F32:
+    """Coefficients (H, W) of the cubic B-splines through the rows of ``levels`` (H, W)."""
+    kernel = (SPLINE_INVERSE / np.sum(SPLINE_INVERSE)).astype(np.float32)
+    return np.asarray(cv2.sepFilter2D(levels, -1, kernel, np.ones(1, dtype=np.float32)))
 
 
 def _padded(values: F32, beyond: float) -> F32:
@@ -92,11 +103,13 @@ def _in_bands(height: int, work: Callable[[int, int], None]) -> None:
 
 
 @compiled(error_model="numpy")
-def _measure(a: F32, b: F32, disparity: F32, first_row: int, end_row: int, weight: F32, pull: F32) -> None:
+def _measure(
+    levels: F32, a: F32, b: F32, disparity: F32, first_row: int, end_row: int, weight: F32, pull: F32
+) -> None:
     """Fill each pixel's weight, ``g^2`` plus that of the prior, and ``g e``, for a step of its disparity.
 
-    ``g`` is the mean of the slopes along the row of ``a`` and of ``b`` at the pixel's partner, and ``e`` is ``b -
-    a``.
+    ``g`` is the mean of the slopes along the row at the pixel and at its partner, and ``e`` is the difference of
+    their grey levels. ``a`` and ``b`` have the splines' coefficients, ``levels`` those of the pixels themselves.
     """
     width = a.shape[1]
     for y in range(first_row, end_row):
@@ -107,18 +120,18 @@ def _measure(a: F32, b: F32, disparity: F32, first_row: int, end_row: int, weigh
                 continue
             i = int(np.floor(at))
             t = np.float32(at - i)
-            w0, w1, w2, w3 = keys_weights(t)
+            w0, w1, w2, w3 = spline_weights(t)
             before, here = b[y, min(max(i - 1, 0), width - 1)], b[y, min(max(i, 0), width - 1)]
             ahead, beyond = b[y, min(max(i + 1, 0), width - 1)], b[y, min(max(i + 2, 0), width - 1)]
             partner = w0 * before + w1 * here + w2 * ahead + w3 * beyond
-            # The kernel's own derivative; on a whole pixel it is the central difference, as for ``a``.
-            bend = 2.0 * before - 5.0 * here + 4.0 * ahead - beyond
+            # The spline's derivative; on a whole pixel it is the coefficients' central difference, as for ``a``.
+            bend = before - 2.0 * here + ahead
             twist = 3.0 * here - before - 3.0 * ahead + beyond
-            slope_b = 0.5 * (ahead - before) + t * bend + 1.5 * t * t * twist
+            slope_b = 0.5 * (ahead - before) + t * bend + 0.5 * t * t * twist
             slope_a = 0.5 * (a[y, min(x + 1, width - 1)] - a[y, max(x - 1, 0)])
             slope = 0.5 * (slope_a + slope_b)
             weight[y, x] += slope * slope
-            pull[y, x] = slope * (partner - a[y, x])
+            pull[y, x] = slope * (partner - levels[y, x])
 
 
 @compiled(error_model="numpy")

@@ -169,6 +169,26 @@ def test_refinement_finds_a_constant_shift() -> None:
     np.testing.assert_array_equal(refine_disparity(left, right, initial, iterations=0), initial)
 
 
+@pytest.mark.parametrize("eighths", [2, 6])
+def test_refinement_of_aliased_images_does_not_depend_on_the_fraction(eighths: int) -> None:
+    """Pixels are means of areas of a texture that is finer than they are, as in cameras without a low-pass filter.
+
+    At shifts of 2 and 6 eighths of a pixel, Keys' kernel errs by 0.046 px in the mean, the spline by 0.012 px.
+    """
+    rng = np.random.default_rng(eighths)
+    texture = cv2.GaussianBlur(rng.standard_normal((1600, 2480)).astype(np.float32), (0, 0), 5.0)
+    levels = 128.0 + 50.0 / float(np.std(texture)) * texture
+
+    def pixels(first: int) -> np.ndarray:
+        means = levels[:, first : first + 2400].reshape(200, 8, 300, 8).mean(axis=(1, 3))
+        return np.clip(np.rint(means), 0, 255).astype(np.uint8)
+
+    truth = 5.0 + eighths / 8.0
+    initial = np.full((200, 300), 5.5, dtype=np.float32)
+    refined = refine_disparity(pixels(0), pixels(40 + eighths), initial)[:, 16:-6]
+    assert abs(float(np.mean(refined)) - truth) < 0.015
+
+
 def test_holes_are_filled_from_behind() -> None:
     nan = np.nan
     rows = np.array(
