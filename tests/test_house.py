@@ -333,7 +333,7 @@ def test_the_documented_entry_point_is_found(documented_solver: Path) -> None:
     assert load_solver_entry("scipy").name == "scipy"
 
 
-OLDER = {"footage", "held-out", "recorded"}
+OLDER = {"footage"}
 """Folders of results with files that code before 1.1 made; empty when 1.1 is released."""
 
 
