@@ -122,7 +122,7 @@ def test_what_is_written_about_the_papers_images_and_readings_is_true_of_them() 
     scenes = ("castle", "old-town", "room")
     best = [min((e, name) for name, e in medians[scene].items() if name.startswith("gs-")) for scene in scenes]
     times = [e / medians[scene]["rs-stereo-refined"] for scene, (e, _) in zip(scenes, best, strict=True)]
-    assert best[0][1] == "gs-stereo-pnp" and all(name.endswith("-scaled") for _, name in best[1:])
+    assert best[0][1] == "gs-8pt" and all(name.endswith("-scaled") for _, name in best[1:])
     for scene, (e, _) in zip(scenes[1:], best[1:], strict=True):  # the twist is the reason, not the shutter
         assert medians[scene]["rs-stereo-refined-twist"] >= e
     assert "is {:.0f}, {:.0f} and {:.0f} times as large".format(*times) in text
