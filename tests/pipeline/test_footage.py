@@ -15,7 +15,7 @@ from rsbench.core.errors import RsbenchError
 from rsbench.core.rig import VIEWS
 from rsbench.dataset.sequence import Sequence
 from rsbench.pipeline.chain import correct_four
-from rsbench.pipeline.footage import FrameSource, check_alike, read_frame, read_rig_card
+from rsbench.pipeline.footage import FrameSource, ImageSource, check_alike, read_frame, read_rig_card
 from rsbench.pipeline.frame_capture import KnownCapture
 from rsbench.pipeline.frame_depth import CorrectionOptions
 from rsbench.pipeline.frame_motion import solve_frames
@@ -29,6 +29,14 @@ def _write(folder: Path, name: str, image: np.ndarray) -> Path:
     path = folder / name
     assert cv2.imwrite(str(path), image)
     return path
+
+
+def test_frames_in_memory_answer_what_files_answer() -> None:
+    images = [np.full((4, 5), level, dtype=np.uint8) for level in (1, 2)]
+    source, other = ImageSource(images), ImageSource([images[0], images[0]])
+    assert (source.video, source.times, source.orientation) == (None, None, 1)
+    assert source.identity() == ImageSource(images).identity() != other.identity()
+    assert [int(image[0, 0]) for image in source.only([1])] == [2]
 
 
 def test_frames_are_read_as_they_are(tmp_path: Path) -> None:
